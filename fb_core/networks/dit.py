@@ -1,0 +1,378 @@
+"""The diffusion transformer over a sequence of views (paper section 3.2): plain pre-norm blocks over all tokens of all views.
+
+The forward pass is five named parts (`embed_patches`, `positions`, `modulate`, `text_context`, `run_blocks`), so that whatever is
+constant during sampling can be computed once. Parameter names are those of the released checkpoint. Where the network is kept in
+half precision, the residual stream, norms, positions and modulations still live in float32, as in the released model.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from fb_core.networks.embeddings import INDEX_MODES, IndexMode, at_least_float32, index_positions, layout_embedding, sincos, timestep_embedding
+
+TIME_SCALE = 1000.0
+TIME_CHANNELS = 256
+EPS = 1e-5
+FINAL_EPS = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiTConfig:
+    """Architecture of the transformer; the defaults are the released one (646M parameters)."""
+
+    heads: int = 16
+    """Attention heads."""
+    head_dim: int = 64
+    """Channels per head; heads * head_dim is the width of the network."""
+    depth: int = 24
+    """Blocks."""
+    patch: int = 2
+    """Side of a token's patch in latent pixels; divides the latents' height and width."""
+    in_channels: int = 66
+    """Noisy latents, conditioning latents and masks per latent pixel (`fb_core.conditioning` owns their order)."""
+    out_channels: int = 32
+    """Predicted velocity channels per latent pixel."""
+    text_width: int | None = 768
+    """Width of the text embedding; 0 or None builds blocks without cross-attention."""
+    index: IndexMode = "flexible"
+    """How views of a sequence are told apart: see `embeddings.index_positions`."""
+    mlp_ratio: int = 4
+    """Hidden width of the feed-forward layers over the network's width."""
+
+    @property
+    def width(self) -> int:
+        """Channels of a token."""
+        return self.heads * self.head_dim
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text_width", self.text_width or 0)
+        for name in ("heads", "head_dim", "depth", "patch", "in_channels", "out_channels", "mlp_ratio"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)}.")
+        if self.text_width < 0:
+            raise ValueError(f"text_width: expected a width, or 0 for a network without text, got {self.text_width}.")
+        if self.width < 8 or self.width % 4:
+            raise ValueError(f"heads * head_dim: expected a multiple of 4 of at least 8 (position embeddings), got {self.width}.")
+        if self.index not in INDEX_MODES:
+            raise ValueError(f"index: expected one of {', '.join(INDEX_MODES)}, got {self.index!r}.")
+
+
+class RMSNorm(nn.Module):
+    """Divide by the root mean square over the last axis, times a learned gain; in float32 at least."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Same shape; float32 for half-precision inputs."""
+        dtype = at_least_float32(x.dtype)
+        return F.rms_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), EPS)
+
+
+class LayerNorm(nn.Module):
+    """Layer norm with learned gain and bias; in float32 at least."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Same shape; float32 for half-precision inputs."""
+        dtype = at_least_float32(x.dtype)
+        return F.layer_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), self.bias.to(dtype), EPS)
+
+
+class Modulation(NamedTuple):
+    """All that the network takes from the time, for b times: what every norm multiplies by and adds."""
+
+    blocks: Float[Tensor, "depth norms 2 b d"]
+    """(scale, shift) of each block's norms, in the order of the norms."""
+    final: Float[Tensor, "2 b d"]
+    """(scale, shift) of the norm before the output."""
+
+
+class TextContext(NamedTuple):
+    """Keys and values of one block's cross-attention."""
+
+    keys: Float[Tensor, "b heads words k"]
+    values: Float[Tensor, "b heads words k"]
+
+
+def _modulated(x: Tensor, scale_shift: Float[Tensor, "2 b d"]) -> Tensor:
+    scale, shift = scale_shift[:, :, None]
+    return torch.addcmul(x + shift, x, scale)
+
+
+class AdaptiveNorm(nn.Module):
+    """A norm whose scale and shift are a linear function of the time embedding (scale first)."""
+
+    def __init__(self, width: int, norm: type[nn.Module]):
+        super().__init__()
+        self.linear = nn.Linear(width, 2 * width, bias=False)
+        self.norm = norm(width)
+
+    def scale_shift(self, activated: Float[Tensor, "b d"]) -> Float[Tensor, "2 b d"]:
+        """Scale and shift of an (already activated) time embedding, float32 at least."""
+        raw = self.linear(activated.to(self.linear.weight.dtype))
+        return rearrange(raw.to(at_least_float32(raw.dtype)), "b (two d) -> two b d", two=2)
+
+    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
+        """Normalised and modulated tokens, in the precision of the parameters."""
+        return _modulated(self.norm(x), scale_shift).to(self.linear.weight.dtype)
+
+
+class Attention(nn.Module):
+    """Multi-head attention with normalised queries and keys; from tokens to themselves or to a text."""
+
+    def __init__(self, config: DiTConfig, context_width: int):
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.norm_q = RMSNorm(config.head_dim)
+        self.norm_k = RMSNorm(config.head_dim)
+        self.to_q = nn.Linear(width, width, bias=False)
+        self.to_k = nn.Linear(context_width, width, bias=False)
+        self.to_v = nn.Linear(context_width, width, bias=False)
+        self.to_out = nn.ModuleList([nn.Linear(width, width)])
+
+    def _split(self, x: Tensor) -> Tensor:
+        return rearrange(x, "b tokens (heads k) -> b heads tokens k", heads=self.heads)
+
+    def keys_values(self, context: Float[Tensor, "b words c"]) -> TextContext:
+        """Keys and values of what is attended to."""
+        values = self._split(self.to_v(context))
+        keys = self.norm_k(self._split(self.to_k(context))).to(values.dtype)
+        return TextContext(keys, values)
+
+    def forward(self, x: Float[Tensor, "b tokens d"], context: TextContext | None = None) -> Float[Tensor, "b tokens d"]:
+        """What every token gathers from `context`, or from all tokens."""
+        keys, values = context or self.keys_values(x)
+        queries = self.norm_q(self._split(self.to_q(x))).to(values.dtype)
+        y = F.scaled_dot_product_attention(queries, keys, values)
+        return self.to_out[0](rearrange(y, "b heads tokens k -> b tokens (heads k)"))
+
+
+class GatedProjection(nn.Module):
+    """One linear layer whose first half is multiplied by the GELU of its second half."""
+
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.proj = nn.Linear(width, 2 * hidden)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`hidden` channels."""
+        value, gate = self.proj(x).chunk(2, dim=-1)
+        return value * F.gelu(gate)
+
+
+class FeedForward(nn.Module):
+    """Two layers on each token by itself."""
+
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.net = nn.ModuleList([GatedProjection(width, hidden), nn.Identity(), nn.Linear(hidden, width)])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Same shape as the input."""
+        return self.net[2](self.net[0](x))
+
+
+class Block(nn.Module):
+    """Self-attention, attention to the text (unless the network has none), feed-forward; each added to the tokens."""
+
+    def __init__(self, config: DiTConfig):
+        super().__init__()
+        width = config.width
+        self.norm1 = AdaptiveNorm(width, RMSNorm)
+        self.attn1 = Attention(config, width)
+        if config.text_width:
+            self.norm2 = AdaptiveNorm(width, RMSNorm)
+            self.attn2 = Attention(config, config.text_width)
+        self.norm3 = AdaptiveNorm(width, LayerNorm)
+        self.ff = FeedForward(width, config.mlp_ratio * width)
+
+    @property
+    def norms(self) -> list[AdaptiveNorm]:
+        """The adaptive norms in the order of their use."""
+        return [self.norm1, self.norm2, self.norm3] if hasattr(self, "norm2") else [self.norm1, self.norm3]
+
+    def forward(
+        self, x: Float[Tensor, "b tokens d"], modulation: Float[Tensor, "norms 2 b d"], context: TextContext | None
+    ) -> Float[Tensor, "b tokens d"]:
+        """The residual stream after this block."""
+        x = x + self.attn1(self.norm1(x, modulation[0]))
+        if context is not None:
+            x = x + self.attn2(self.norm2(x, modulation[1]), context)
+        return x + self.ff(self.norm3(x, modulation[-1]))
+
+
+class PatchEmbedding(nn.Module):
+    """Holds the patch projection as the convolution it is in the checkpoint."""
+
+    def __init__(self, config: DiTConfig):
+        super().__init__()
+        self.proj = nn.Conv2d(config.in_channels, config.width, config.patch, stride=config.patch)
+
+
+class TimestepEmbedder(nn.Module):
+    """Two layers on the sinusoidal timestep."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.linear_1 = nn.Linear(TIME_CHANNELS, width)
+        self.linear_2 = nn.Linear(width, width)
+
+    def forward(self, time: Float[Tensor, "b"]) -> Float[Tensor, "b d"]:
+        """Embedding of times in [0, 1]."""
+        embedding = timestep_embedding(TIME_SCALE * time.to(at_least_float32(time.dtype)), TIME_CHANNELS)
+        return self.linear_2(F.silu(self.linear_1(embedding.to(self.linear_1.weight.dtype))))
+
+
+class TimeEmbedding(nn.Module):
+    """Holds the time layers under their name in the checkpoint."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.timestep_embedder = TimestepEmbedder(width)
+
+    def forward(self, time: Float[Tensor, "b"]) -> Float[Tensor, "b d"]:
+        """Embedding of times in [0, 1]."""
+        return self.timestep_embedder(time)
+
+
+class DiT(nn.Module):
+    """Predicts the velocity of the noisy latents of all views of a sequence together."""
+
+    def __init__(self, config: DiTConfig):
+        super().__init__()
+        self.config = config
+        self.pos_embed = PatchEmbedding(config)
+        self.time_embed = TimeEmbedding(config.width)
+        self.transformer_blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
+        self.proj_out_1 = nn.Linear(config.width, 2 * config.width)
+        self.proj_out_2 = nn.Linear(config.width, config.patch**2 * config.out_channels)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the parameters."""
+        return self.proj_out_2.weight.dtype
+
+    def forward(
+        self,
+        sequence: Float[Tensor, "b n c h w"],
+        time: Float[Tensor, "b"],
+        text: Float[Tensor, "b words t"] | None = None,
+        index: Float[Tensor, "b n"] | None = None,
+    ) -> Float[Tensor, "b n z h w"]:
+        """Velocity (noise minus data) of the sequence at `time` in [0, 1], 1 being noise; in the sequence's precision.
+
+        `text` is given exactly if the configuration has a text width. `index` holds one position in [0, 2 pi] per view (draw it
+        with `index_positions` in training); None means evenly spaced. Raises ValueError for no views, for a size that the patch
+        does not divide, for another channel count, and for a text that is missing or too much.
+        """
+        _, views, channels, height, width = sequence.shape
+        if channels != self.config.in_channels:
+            raise ValueError(f"sequence: expected {self.config.in_channels} channels, got {channels}.")
+        tokens = self.embed_patches(sequence) + self.positions(views, height, width, index, device=sequence.device)
+        modulation = self.modulate(time)
+        velocity = self.run_blocks(tokens, modulation, self.text_context(text))
+        return self.unpatchify(velocity, views, height, width).to(sequence.dtype)
+
+    def embed_patches(self, sequence: Float[Tensor, "b n c h w"], first_channel: int = 0, bias: bool = True) -> Float[Tensor, "b tokens d"]:
+        """Project patches to tokens, in the order (view, row, column).
+
+        The projection is linear in the channels: the tokens of a sequence are the sum over any split of its channels, each part
+        projected from its `first_channel` on and one of them with the bias.
+        """
+        patch, proj = self.config.patch, self.pos_embed.proj
+        _, views, channels, height, width = sequence.shape
+        if not views:
+            raise ValueError("sequence: expected at least one view, got none.")
+        if not height or not width or height % patch or width % patch:
+            raise ValueError(f"sequence: expected latent height and width to be positive multiples of {patch}, got {height} x {width}.")
+        weight = rearrange(proj.weight[:, first_channel : first_channel + channels], "d c p q -> d (c p q)")
+        patches = rearrange(sequence.to(self.dtype), "b n c (h p) (w q) -> b (n h w) (c p q)", p=patch, q=patch)
+        return F.linear(patches, weight, proj.bias if bias else None)
+
+    def positions(
+        self,
+        views: int,
+        height: int,
+        width: int,
+        index: Float[Tensor, "b n"] | None = None,
+        *,
+        device: torch.device | str | None = None,
+    ) -> Float[Tensor, "b tokens d"]:
+        """What is added to the tokens of `views` latents of a size: place in the view, and which view. float32; b is 1 without `index`."""
+        config = self.config
+        layout = layout_embedding(height // config.patch, width // config.patch, config.width, device=device)
+        layout = rearrange(layout, "h w d -> 1 1 (h w) d")
+        if config.index == "none":
+            return repeat(layout, "1 1 places d -> 1 (views places) d", views=views)
+        if index is None:
+            index = index_positions(config.index, 1, views, device=device)
+        if index.shape[1] != views:
+            raise ValueError(f"index: expected one position for each of {views} views, got {index.shape[1]}.")
+        which = sincos(index.to(device=device, dtype=layout.dtype), config.width)
+        return rearrange(layout + which[:, :, None], "b views places d -> b (views places) d")
+
+    def modulate(self, time: Float[Tensor, "b"]) -> Modulation:
+        """Scales and shifts of all norms at `time` in [0, 1]."""
+        activated = self.time_embed(time)
+        activated = F.silu(activated.to(at_least_float32(activated.dtype)))
+        blocks = [torch.stack([norm.scale_shift(activated) for norm in block.norms]) for block in self.transformer_blocks]
+        final = self.proj_out_1(activated.to(self.dtype))
+        # The released layer holds the shift first here, unlike in the blocks.
+        shift, scale = final.to(at_least_float32(final.dtype)).chunk(2, dim=-1)
+        return Modulation(torch.stack(blocks), torch.stack([scale, shift]))
+
+    def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[TextContext] | list[None]:
+        """Keys and values of every block's cross-attention; Nones for a network without text."""
+        expected = self.config.text_width
+        if not expected:
+            if text is not None:
+                raise ValueError("text: expected None because this network was built without text, got an embedding.")
+            return [None] * self.config.depth
+        if text is None or text.shape[-1] != expected:
+            got = "None" if text is None else f"width {text.shape[-1]}"
+            raise ValueError(f"text: expected an embedding of width {expected} (that of the empty prompt for no text), got {got}.")
+        return [block.attn2.keys_values(text.to(self.dtype)) for block in self.transformer_blocks]
+
+    def run_blocks(
+        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: list[TextContext] | list[None]
+    ) -> Float[Tensor, "b tokens out"]:
+        """Patches of velocity of tokens that carry their positions."""
+        for block, block_modulation, context in zip(self.transformer_blocks, modulation.blocks, contexts, strict=True):
+            tokens = block(tokens, block_modulation, context)
+        tokens = F.layer_norm(tokens, tokens.shape[-1:], eps=FINAL_EPS)
+        return self.proj_out_2(_modulated(tokens, modulation.final).to(self.dtype))
+
+    def unpatchify(self, patches: Float[Tensor, "b tokens out"], views: int, height: int, width: int) -> Float[Tensor, "b n z h w"]:
+        """Latents of (view, row, column) tokens whose channels are ordered (row in patch, column in patch, channel)."""
+        p = self.config.patch
+        return rearrange(patches, "b (n h w) (p q z) -> b n z (h p) (w q)", n=views, h=height // p, w=width // p, p=p, q=p)
+
+    @torch.no_grad()
+    def initialize(self, generator: torch.Generator) -> "DiT":
+        """Draw weights for training from scratch: zero velocity, no influence of the time, small residual branches."""
+        branches = 3 * self.config.depth
+        for name, parameter in self.named_parameters():
+            if parameter.ndim == 1:
+                parameter.fill_(0.0 if name.endswith("bias") else 1.0)
+                continue
+            std = parameter[0].numel() ** -0.5
+            if name.endswith(("norm1.linear.weight", "norm2.linear.weight", "norm3.linear.weight", "proj_out_1.weight", "proj_out_2.weight")):
+                std = 0.0
+            elif name.endswith(("to_out.0.weight", "ff.net.2.weight")):
+                std /= math.sqrt(branches)
+            parameter.copy_(torch.randn(parameter.shape, generator=generator, device=generator.device) * std)
+        return self
