@@ -1,0 +1,80 @@
+"""What every test shares: run-time shape checks, seeds, few threads, the shared data folder, one tiny capture."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+from pathlib import Path
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+# Installed before any test imports fb_core, so that every annotated function and dataclass checks its shapes.
+jaxtyping.install_import_hook("fb_core", "beartype.beartype")
+
+torch.set_num_threads(min(2, torch.get_num_threads()))
+settings.register_profile("fillerbuster", deadline=None, derandomize=True, max_examples=25)
+settings.load_profile("fillerbuster")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Markers live here so that a lone test file runs without warnings."""
+    config.addinivalue_line("markers", "slow: takes more than a few seconds; deselect with -m 'not slow'")
+
+
+def shared_path(relative: str) -> Path:
+    """A file or folder of the shared data (goldens, sample captures), or a skip that names what is absent.
+
+    The folder is the environment variable FILLERBUSTER_SHARED, or ``shared`` beside the repository.
+    """
+    root = Path(os.environ.get("FILLERBUSTER_SHARED") or Path(__file__).resolve().parents[2] / "shared")
+    path = root / relative
+    if not path.exists():
+        pytest.skip(f"shared data {relative!r} not found (set FILLERBUSTER_SHARED to the folder that holds it)")
+    return path
+
+
+@pytest.fixture(name="shared_path", scope="session")
+def _shared_path_fixture():
+    """The function :func:`shared_path`, for tests that take it as an argument instead of importing it."""
+    return shared_path
+
+
+@pytest.fixture(autouse=True)
+def _same_random_numbers() -> None:
+    """Every test starts from the same global seeds, alone or in the suite."""
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def _tiny_capture_original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six 48x32 views on a ring of radius 2 that look at a smooth pattern, every second one with a mask, and 50 points."""
+    from fb_core.data.captures import FrameToWrite, Points, write_capture
+    from fb_core.geometry.cameras import Pinholes
+
+    angles = torch.arange(6, dtype=torch.float64) * torch.pi / 3
+    centers = torch.stack([2 * angles.cos(), 2 * angles.sin(), 0.3 * angles.sin()], dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    cameras = Pinholes.looking_at(centers, torch.zeros_like(centers), up=up, fov_degrees=60.0, width=48, height=32)
+    frames = []
+    for index in range(6):
+        directions = cameras[index].directions()[0].permute(2, 0, 1)
+        image = (0.5 + 0.5 * torch.sin(3 * directions + torch.arange(3)[:, None, None])).float()
+        mask = torch.ones(1, 32, 48)
+        mask[:, 8:16, 10:30] = 0.0
+        frames.append(FrameToWrite(name=f"view_{index:03d}", image=image, mask=mask if index % 2 else None, camera=cameras[index]))
+    generator = torch.Generator().manual_seed(0)
+    points = Points(positions=torch.randn(50, 3, generator=generator), colors=torch.rand(50, 3, generator=generator))
+    return write_capture(tmp_path_factory.mktemp("tiny") / "capture", frames, points=points).root
+
+
+@pytest.fixture
+def tiny_capture(_tiny_capture_original: Path, tmp_path: Path) -> Path:
+    """A fresh folder with a small valid capture (transforms.json, images, masks, points); a test may damage it."""
+    return Path(shutil.copytree(_tiny_capture_original, tmp_path / "tiny_capture"))
