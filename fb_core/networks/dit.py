@@ -1,8 +1,7 @@
 """The diffusion transformer over a sequence of views (paper section 3.2): plain pre-norm blocks over all tokens of all views.
 
-The forward pass is five named parts (`embed_patches`, `positions`, `modulate`, `text_context`, `run_blocks`), so that whatever is
-constant during sampling can be computed once. Parameter names are those of the released checkpoint. Where the network is kept in
-half precision, the residual stream, norms, positions and modulations still live in float32, as in the released model.
+The forward pass is made of named parts (`embed_patches`, `positions`, `modulate`, `text_context`, `run_blocks`, `unpatchify`), so
+that whatever is constant during sampling can be computed once. Parameter names are those of the released checkpoint.
 """
 
 import math
@@ -15,11 +14,19 @@ from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from fb_core.networks.embeddings import INDEX_MODES, IndexMode, at_least_float32, index_positions, layout_embedding, sincos, timestep_embedding
+from fb_core.networks.blocks import Block, KeysValues, modulated
+from fb_core.networks.embeddings import (
+    INDEX_MODES,
+    IndexMode,
+    at_least_float32,
+    index_positions,
+    layout_embedding,
+    sincos,
+    timestep_embedding,
+)
 
 TIME_SCALE = 1000.0
 TIME_CHANNELS = 256
-EPS = 1e-5
 FINAL_EPS = 1e-6
 
 
@@ -64,33 +71,6 @@ class DiTConfig:
             raise ValueError(f"index: expected one of {', '.join(INDEX_MODES)}, got {self.index!r}.")
 
 
-class RMSNorm(nn.Module):
-    """Divide by the root mean square over the last axis, times a learned gain; in float32 at least."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Same shape; float32 for half-precision inputs."""
-        dtype = at_least_float32(x.dtype)
-        return F.rms_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), EPS)
-
-
-class LayerNorm(nn.Module):
-    """Layer norm with learned gain and bias; in float32 at least."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(width))
-        self.bias = nn.Parameter(torch.zeros(width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Same shape; float32 for half-precision inputs."""
-        dtype = at_least_float32(x.dtype)
-        return F.layer_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), self.bias.to(dtype), EPS)
-
-
 class Modulation(NamedTuple):
     """All that the network takes from the time, for b times: what every norm multiplies by and adds."""
 
@@ -100,123 +80,8 @@ class Modulation(NamedTuple):
     """(scale, shift) of the norm before the output."""
 
 
-class TextContext(NamedTuple):
-    """Keys and values of one block's cross-attention."""
-
-    keys: Float[Tensor, "b heads words k"]
-    values: Float[Tensor, "b heads words k"]
-
-
-def _modulated(x: Tensor, scale_shift: Float[Tensor, "2 b d"]) -> Tensor:
-    scale, shift = scale_shift[:, :, None]
-    return torch.addcmul(x + shift, x, scale)
-
-
-class AdaptiveNorm(nn.Module):
-    """A norm whose scale and shift are a linear function of the time embedding (scale first)."""
-
-    def __init__(self, width: int, norm: type[nn.Module]):
-        super().__init__()
-        self.linear = nn.Linear(width, 2 * width, bias=False)
-        self.norm = norm(width)
-
-    def scale_shift(self, activated: Float[Tensor, "b d"]) -> Float[Tensor, "2 b d"]:
-        """Scale and shift of an (already activated) time embedding, float32 at least."""
-        raw = self.linear(activated.to(self.linear.weight.dtype))
-        return rearrange(raw.to(at_least_float32(raw.dtype)), "b (two d) -> two b d", two=2)
-
-    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
-        """Normalised and modulated tokens, in the precision of the parameters."""
-        return _modulated(self.norm(x), scale_shift).to(self.linear.weight.dtype)
-
-
-class Attention(nn.Module):
-    """Multi-head attention with normalised queries and keys; from tokens to themselves or to a text."""
-
-    def __init__(self, config: DiTConfig, context_width: int):
-        super().__init__()
-        width = config.width
-        self.heads = config.heads
-        self.norm_q = RMSNorm(config.head_dim)
-        self.norm_k = RMSNorm(config.head_dim)
-        self.to_q = nn.Linear(width, width, bias=False)
-        self.to_k = nn.Linear(context_width, width, bias=False)
-        self.to_v = nn.Linear(context_width, width, bias=False)
-        self.to_out = nn.ModuleList([nn.Linear(width, width)])
-
-    def _split(self, x: Tensor) -> Tensor:
-        return rearrange(x, "b tokens (heads k) -> b heads tokens k", heads=self.heads)
-
-    def keys_values(self, context: Float[Tensor, "b words c"]) -> TextContext:
-        """Keys and values of what is attended to."""
-        values = self._split(self.to_v(context))
-        keys = self.norm_k(self._split(self.to_k(context))).to(values.dtype)
-        return TextContext(keys, values)
-
-    def forward(self, x: Float[Tensor, "b tokens d"], context: TextContext | None = None) -> Float[Tensor, "b tokens d"]:
-        """What every token gathers from `context`, or from all tokens."""
-        keys, values = context or self.keys_values(x)
-        queries = self.norm_q(self._split(self.to_q(x))).to(values.dtype)
-        y = F.scaled_dot_product_attention(queries, keys, values)
-        return self.to_out[0](rearrange(y, "b heads tokens k -> b tokens (heads k)"))
-
-
-class GatedProjection(nn.Module):
-    """One linear layer whose first half is multiplied by the GELU of its second half."""
-
-    def __init__(self, width: int, hidden: int):
-        super().__init__()
-        self.proj = nn.Linear(width, 2 * hidden)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """`hidden` channels."""
-        value, gate = self.proj(x).chunk(2, dim=-1)
-        return value * F.gelu(gate)
-
-
-class FeedForward(nn.Module):
-    """Two layers on each token by itself."""
-
-    def __init__(self, width: int, hidden: int):
-        super().__init__()
-        self.net = nn.ModuleList([GatedProjection(width, hidden), nn.Identity(), nn.Linear(hidden, width)])
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Same shape as the input."""
-        return self.net[2](self.net[0](x))
-
-
-class Block(nn.Module):
-    """Self-attention, attention to the text (unless the network has none), feed-forward; each added to the tokens."""
-
-    def __init__(self, config: DiTConfig):
-        super().__init__()
-        width = config.width
-        self.norm1 = AdaptiveNorm(width, RMSNorm)
-        self.attn1 = Attention(config, width)
-        if config.text_width:
-            self.norm2 = AdaptiveNorm(width, RMSNorm)
-            self.attn2 = Attention(config, config.text_width)
-        self.norm3 = AdaptiveNorm(width, LayerNorm)
-        self.ff = FeedForward(width, config.mlp_ratio * width)
-
-    @property
-    def norms(self) -> list[AdaptiveNorm]:
-        """The adaptive norms in the order of their use."""
-        return [self.norm1, self.norm2, self.norm3] if hasattr(self, "norm2") else [self.norm1, self.norm3]
-
-    def forward(
-        self, x: Float[Tensor, "b tokens d"], modulation: Float[Tensor, "norms 2 b d"], context: TextContext | None
-    ) -> Float[Tensor, "b tokens d"]:
-        """The residual stream after this block."""
-        x = x + self.attn1(self.norm1(x, modulation[0]))
-        if context is not None:
-            x = x + self.attn2(self.norm2(x, modulation[1]), context)
-        return x + self.ff(self.norm3(x, modulation[-1]))
-
-
 class PatchEmbedding(nn.Module):
-    """Holds the patch projection as the convolution it is in the checkpoint."""
+    """Holds the patch projection as the convolution that it is in the checkpoint; `DiT.embed_patches` applies it."""
 
     def __init__(self, config: DiTConfig):
         super().__init__()
@@ -244,10 +109,6 @@ class TimeEmbedding(nn.Module):
         super().__init__()
         self.timestep_embedder = TimestepEmbedder(width)
 
-    def forward(self, time: Float[Tensor, "b"]) -> Float[Tensor, "b d"]:
-        """Embedding of times in [0, 1]."""
-        return self.timestep_embedder(time)
-
 
 class DiT(nn.Module):
     """Predicts the velocity of the noisy latents of all views of a sequence together."""
@@ -257,7 +118,9 @@ class DiT(nn.Module):
         self.config = config
         self.pos_embed = PatchEmbedding(config)
         self.time_embed = TimeEmbedding(config.width)
-        self.transformer_blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
+        self.transformer_blocks = nn.ModuleList(
+            Block(config.width, config.heads, config.mlp_ratio * config.width, config.text_width) for _ in range(config.depth)
+        )
         self.proj_out_1 = nn.Linear(config.width, 2 * config.width)
         self.proj_out_2 = nn.Linear(config.width, config.patch**2 * config.out_channels)
 
@@ -327,7 +190,7 @@ class DiT(nn.Module):
 
     def modulate(self, time: Float[Tensor, "b"]) -> Modulation:
         """Scales and shifts of all norms at `time` in [0, 1]."""
-        activated = self.time_embed(time)
+        activated = self.time_embed.timestep_embedder(time)
         activated = F.silu(activated.to(at_least_float32(activated.dtype)))
         blocks = [torch.stack([norm.scale_shift(activated) for norm in block.norms]) for block in self.transformer_blocks]
         final = self.proj_out_1(activated.to(self.dtype))
@@ -335,7 +198,7 @@ class DiT(nn.Module):
         shift, scale = final.to(at_least_float32(final.dtype)).chunk(2, dim=-1)
         return Modulation(torch.stack(blocks), torch.stack([scale, shift]))
 
-    def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[TextContext] | list[None]:
+    def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[KeysValues] | list[None]:
         """Keys and values of every block's cross-attention; Nones for a network without text."""
         expected = self.config.text_width
         if not expected:
@@ -348,13 +211,13 @@ class DiT(nn.Module):
         return [block.attn2.keys_values(text.to(self.dtype)) for block in self.transformer_blocks]
 
     def run_blocks(
-        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: list[TextContext] | list[None]
+        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: list[KeysValues] | list[None]
     ) -> Float[Tensor, "b tokens out"]:
         """Patches of velocity of tokens that carry their positions."""
         for block, block_modulation, context in zip(self.transformer_blocks, modulation.blocks, contexts, strict=True):
             tokens = block(tokens, block_modulation, context)
         tokens = F.layer_norm(tokens, tokens.shape[-1:], eps=FINAL_EPS)
-        return self.proj_out_2(_modulated(tokens, modulation.final).to(self.dtype))
+        return self.proj_out_2(modulated(tokens, modulation.final).to(self.dtype))
 
     def unpatchify(self, patches: Float[Tensor, "b tokens out"], views: int, height: int, width: int) -> Float[Tensor, "b n z h w"]:
         """Latents of (view, row, column) tokens whose channels are ordered (row in patch, column in patch, channel)."""
@@ -370,7 +233,9 @@ class DiT(nn.Module):
                 parameter.fill_(0.0 if name.endswith("bias") else 1.0)
                 continue
             std = parameter[0].numel() ** -0.5
-            if name.endswith(("norm1.linear.weight", "norm2.linear.weight", "norm3.linear.weight", "proj_out_1.weight", "proj_out_2.weight")):
+            if name.endswith(
+                ("norm1.linear.weight", "norm2.linear.weight", "norm3.linear.weight", "proj_out_1.weight", "proj_out_2.weight")
+            ):
                 std = 0.0
             elif name.endswith(("to_out.0.weight", "ff.net.2.weight")):
                 std /= math.sqrt(branches)

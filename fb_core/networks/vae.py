@@ -241,7 +241,9 @@ class VAE(nn.Module):
         if channels != self.config.in_channels:
             raise ValueError(f"x01: expected {self.config.in_channels} channels, got {channels}.")
         if height % factor or width % factor or not height or not width:
-            raise ValueError(f"x01: expected height and width to be positive multiples of {factor}, got {height} x {width}; crop or resize.")
+            raise ValueError(
+                f"x01: expected height and width to be positive multiples of {factor}, got {height} x {width}; crop or resize."
+            )
         moments = self.quant_conv(self.encoder((2 * x01 - 1).to(self.dtype)))
         mean, logvar = moments.to(x01.dtype).chunk(2, dim=1)
         return mean, logvar.clamp(*LOGVAR_RANGE)

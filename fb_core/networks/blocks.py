@@ -1,0 +1,159 @@
+"""The transformer's parts: norms that the time modulates, attention, feed-forward, and the block made of them.
+
+Parameter names are those of the released checkpoint. In half precision the residual stream, the norms and the modulations stay in
+float32, as in the released model; only matrix products and attention run in the parameters' precision.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from fb_core.networks.embeddings import at_least_float32
+
+EPS = 1e-5
+
+
+class RMSNorm(nn.Module):
+    """Divide by the root mean square over the last axis, times a learned gain; in float32 at least."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        """Same shape; float32 for half-precision inputs."""
+        dtype = at_least_float32(x.dtype)
+        return F.rms_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), EPS)
+
+
+class LayerNorm(nn.Module):
+    """Layer norm with learned gain and bias; in float32 at least."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        """Same shape; float32 for half-precision inputs."""
+        dtype = at_least_float32(x.dtype)
+        return F.layer_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), self.bias.to(dtype), EPS)
+
+
+def modulated(x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
+    """x * (1 + scale) + shift, the same for all tokens of a sample."""
+    scale, shift = scale_shift[0, :, None], scale_shift[1, :, None]
+    return torch.addcmul(x + shift, x, scale)
+
+
+class AdaptiveNorm(nn.Module):
+    """A norm whose scale and shift are a linear function of the time embedding (scale first)."""
+
+    def __init__(self, width: int, norm: type[nn.Module]):
+        super().__init__()
+        self.linear = nn.Linear(width, 2 * width, bias=False)
+        self.norm = norm(width)
+
+    def scale_shift(self, activated: Float[Tensor, "b d"]) -> Float[Tensor, "2 b d"]:
+        """Scale and shift of an (already activated) time embedding; float32 at least."""
+        raw = self.linear(activated.to(self.linear.weight.dtype))
+        return rearrange(raw.to(at_least_float32(raw.dtype)), "b (two d) -> two b d", two=2)
+
+    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
+        """Normalised and modulated tokens, in the precision of the parameters."""
+        return modulated(self.norm(x), scale_shift).to(self.linear.weight.dtype)
+
+
+class KeysValues(NamedTuple):
+    """What attention looks up."""
+
+    keys: Float[Tensor, "b heads words k"]
+    values: Float[Tensor, "b heads words k"]
+
+
+class Attention(nn.Module):
+    """Multi-head attention with normalised queries and keys; from tokens to themselves or to a text."""
+
+    def __init__(self, width: int, heads: int, context_width: int):
+        super().__init__()
+        self.heads = heads
+        self.norm_q = RMSNorm(width // heads)
+        self.norm_k = RMSNorm(width // heads)
+        self.to_q = nn.Linear(width, width, bias=False)
+        self.to_k = nn.Linear(context_width, width, bias=False)
+        self.to_v = nn.Linear(context_width, width, bias=False)
+        self.to_out = nn.ModuleList([nn.Linear(width, width)])
+
+    def _split(self, x: Float[Tensor, "b tokens d"]) -> Float[Tensor, "b heads tokens k"]:
+        return rearrange(x, "b tokens (heads k) -> b heads tokens k", heads=self.heads)
+
+    def keys_values(self, context: Float[Tensor, "b words c"]) -> KeysValues:
+        """Keys and values of what is attended to."""
+        values = self._split(self.to_v(context))
+        keys = self.norm_k(self._split(self.to_k(context))).to(values.dtype)
+        return KeysValues(keys, values)
+
+    def forward(self, x: Float[Tensor, "b tokens d"], context: KeysValues | None = None) -> Float[Tensor, "b tokens d"]:
+        """What every token gathers from `context`, or from all tokens."""
+        keys, values = self.keys_values(x) if context is None else context
+        queries = self.norm_q(self._split(self.to_q(x))).to(values.dtype)
+        y = F.scaled_dot_product_attention(queries, keys, values)
+        return self.to_out[0](rearrange(y, "b heads tokens k -> b tokens (heads k)"))
+
+
+class GatedProjection(nn.Module):
+    """One linear layer whose first half is multiplied by the GELU of its second half."""
+
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.proj = nn.Linear(width, 2 * hidden)
+
+    def forward(self, x: Float[Tensor, "b tokens d"]) -> Float[Tensor, "b tokens hidden"]:
+        """`hidden` channels."""
+        value, gate = self.proj(x).chunk(2, dim=-1)
+        return value * F.gelu(gate)
+
+
+class FeedForward(nn.Module):
+    """Two layers on each token by itself."""
+
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.net = nn.ModuleList([GatedProjection(width, hidden), nn.Identity(), nn.Linear(hidden, width)])
+
+    def forward(self, x: Float[Tensor, "b tokens d"]) -> Float[Tensor, "b tokens d"]:
+        """Same shape as the input."""
+        return self.net[2](self.net[0](x))
+
+
+class Block(nn.Module):
+    """Self-attention, attention to the text (unless `text_width` is 0), feed-forward; each added to the tokens."""
+
+    def __init__(self, width: int, heads: int, hidden: int, text_width: int):
+        super().__init__()
+        self.norm1 = AdaptiveNorm(width, RMSNorm)
+        self.attn1 = Attention(width, heads, width)
+        if text_width:
+            self.norm2 = AdaptiveNorm(width, RMSNorm)
+            self.attn2 = Attention(width, heads, text_width)
+        self.norm3 = AdaptiveNorm(width, LayerNorm)
+        self.ff = FeedForward(width, hidden)
+        self.reads_text = bool(text_width)
+
+    @property
+    def norms(self) -> list[AdaptiveNorm]:
+        """The adaptive norms in the order of their use."""
+        return [self.norm1, self.norm2, self.norm3] if self.reads_text else [self.norm1, self.norm3]
+
+    def forward(
+        self, x: Float[Tensor, "b tokens d"], scale_shifts: Float[Tensor, "norms 2 b d"], text: KeysValues | None
+    ) -> Float[Tensor, "b tokens d"]:
+        """The residual stream after this block, given its norms' modulation and the text's keys and values (None without text)."""
+        x = x + self.attn1(self.norm1(x, scale_shifts[0]))
+        if text is not None:
+            x = x + self.attn2(self.norm2(x, scale_shifts[1]), text)
+        return x + self.ff(self.norm3(x, scale_shifts[-1]))
