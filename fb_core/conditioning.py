@@ -1,0 +1,109 @@
+"""Conditioning (paper, Eq. 1): encode what is known, concatenate, split the prediction. The one owner of channel order.
+
+The network's 66 input channels are, in the order of the released weights:
+[0:16] noisy image latent, [16:32] noisy raymap latent, [32:48] latent of the masked image, [48:64] latent of the masked
+raymap, [64] image mask, [65] ray mask. Its 32 outputs are the image velocity [0:16] and the raymap velocity [16:32].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.masks import to_latent_grid
+from fb_core.networks.vae import VAE
+
+LATENT_CHANNELS = 16
+STATE_CHANNELS = 2 * LATENT_CHANNELS
+CONDITIONING_CHANNELS = 2 * LATENT_CHANNELS + 2
+SEQUENCE_CHANNELS = STATE_CHANNELS + CONDITIONING_CHANNELS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditioning:
+    """What the network is told, on the latent grid, for n views (leading batch dimensions are allowed)."""
+
+    channels: Float[Tensor, "*b 34 h w"]
+    """Masked image latent, masked raymap latent, image mask, ray mask."""
+
+    @property
+    def image_known(self) -> Float[Tensor, "*b 1 h w"]:
+        """Share of known pixels per latent cell."""
+        return self.channels[..., 2 * LATENT_CHANNELS : 2 * LATENT_CHANNELS + 1, :, :]
+
+    @property
+    def rays_known(self) -> Float[Tensor, "*b 1 h w"]:
+        """Share of known rays per latent cell."""
+        return self.channels[..., 2 * LATENT_CHANNELS + 1 :, :, :]
+
+
+def only_known(values: Float[Tensor, "n c h w"], known: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n c h w"]:
+    """``values`` where known (scaled by a fractional mask), 0 elsewhere. Chosen, not multiplied: NaN in unknown pixels does not survive."""
+    return torch.where(known > 0, values * known, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def assemble(
+    image_latents: Float[Tensor, "*b 16 h w"],
+    ray_latents: Float[Tensor, "*b 16 h w"],
+    image_known: Float[Tensor, "*b 1 h w"],
+    rays_known: Float[Tensor, "*b 1 h w"],
+) -> Conditioning:
+    """Put the encoded parts in channel order."""
+    return Conditioning(channels=torch.cat([image_latents, ray_latents, image_known, rays_known], dim=-3))
+
+
+def encode_known(
+    images: Float[Tensor, "n 3 hp wp"],
+    image_known: Float[Tensor, "n 1 hp wp"],
+    raymaps01: Float[Tensor, "n 6 hp wp"],
+    rays_known: Float[Tensor, "n 1 hp wp"],
+    *,
+    image_vae: VAE,
+    raymap_vae: VAE,
+    views_at_once: int = 16,
+) -> Conditioning:
+    """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1)."""
+    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once)
+    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once)
+    return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known))
+
+
+def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: tuple[int, int]) -> Conditioning:
+    """The conditioning of "nothing is known", for classifier-free guidance: one black image and one raymap of zeros, encoded once."""
+    black = next(image_vae.parameters()).new_zeros(1, 3, *pixels)
+    no_rays = next(raymap_vae.parameters()).new_zeros(1, 6, *pixels)
+    image_latent = image_vae.encode(black).to(like.channels.dtype)
+    ray_latent = raymap_vae.encode(no_rays).to(like.channels.dtype)
+    masks = like.channels.new_zeros(1, 2, *like.channels.shape[-2:])
+    null = torch.cat([image_latent, ray_latent, masks], dim=-3)
+    return Conditioning(channels=null.expand(like.channels.shape))
+
+
+def encode_in_chunks(vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int) -> Float[Tensor, "n 16 lh lw"]:
+    """Latents of n views, a few at a time so that memory does not grow with n; in float32 for the sampler."""
+    dtype = next(vae.parameters()).dtype
+    return torch.cat([vae.encode(chunk.to(dtype)).float() for chunk in pixels.split(views_at_once)])
+
+
+def decode_in_chunks(vae: VAE, latents: Float[Tensor, "n 16 lh lw"], views_at_once: int = 16) -> Float[Tensor, "n c h w"]:
+    """Pixels in [0, 1] of n views, a few at a time, in float32."""
+    dtype = next(vae.parameters()).dtype
+    return torch.cat([vae.decode(chunk.to(dtype), clamp=True).float() for chunk in latents.split(views_at_once)])
+
+
+def join(state: Float[Tensor, "*b 32 h w"], conditioning: Conditioning) -> Float[Tensor, "*b 66 h w"]:
+    """The sequence s_t of Eq. 1 in channel order."""
+    return torch.cat([state, conditioning.channels.to(state.dtype)], dim=-3)
+
+
+def split(state: Float[Tensor, "*b 32 h w"]) -> tuple[Float[Tensor, "*b 16 h w"], Float[Tensor, "*b 16 h w"]]:
+    """(image part, raymap part) of a state or of a predicted velocity."""
+    return state[..., :LATENT_CHANNELS, :, :], state[..., LATENT_CHANNELS:, :, :]
+
+
+def unsplit(image: Float[Tensor, "*b 16 h w"], rays: Float[Tensor, "*b 16 h w"]) -> Float[Tensor, "*b 32 h w"]:
+    """Inverse of :func:`split`."""
+    return torch.cat([image, rays], dim=-3)

@@ -1,0 +1,119 @@
+"""Raymaps (paper, section 3.1): 3 origin and 3 unit direction channels per pixel, and the canonical frame they live in.
+
+The canonical frame puts one reference camera at the origin, turns its up axis to +z, gives it a heading, and scales all
+origins into the cube [-1, 1]^3. It is a similarity, so it has an exact inverse.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+
+_SCALE_MARGIN = 1e-6  # keeps the largest origin strictly inside the cube
+
+
+def raymaps_of(cameras: Pinholes) -> Float[Tensor, "n 6 h w"]:
+    """World-space raymaps: channels 0-2 the camera centre (scene units), 3-5 the unit direction through the pixel centre."""
+    directions = cameras.directions().permute(0, 3, 1, 2)
+    origins = cameras.centers[:, :, None, None].expand_as(directions)
+    return torch.cat([origins, directions], dim=1)
+
+
+def to_unit_range(raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+    """Canonical raymaps (origins and directions in [-1, 1]) to the [0, 1] range that the raymap VAE takes."""
+    return raymaps / 2 + 0.5
+
+
+def from_unit_range(raymaps01: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+    """Inverse of :func:`to_unit_range`; directions are brought back to unit length (a zero direction stays zero)."""
+    raymaps = raymaps01 * 2 - 1
+    return torch.cat([raymaps[:, :3], F.normalize(raymaps[:, 3:], dim=1)], dim=1)
+
+
+def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
+    """Camera-to-world rotation of a pinhole camera from its ray directions alone (columns: right, down, forward).
+
+    The rays of one pixel row span a plane that holds the right axis, so the normals of two rows' planes cross in it; columns give the
+    down axis. Exact for any principal point and any focal lengths without skew; needs at least 2x2 pixels.
+    """
+    rays = directions.double()
+    row_normals = [torch.linalg.cross(rays[:, row, 0], rays[:, row, -1]) for row in (0, -1)]
+    column_normals = [torch.linalg.cross(rays[:, 0, column], rays[:, -1, column]) for column in (0, -1)]
+    # The plane normals of rows point down, those of columns left; crossing upper with lower (left with right) gives the axis up to its sign.
+    right = F.normalize(torch.linalg.cross(row_normals[0], row_normals[1]), dim=0)
+    down = F.normalize(torch.linalg.cross(column_normals[0], column_normals[1]), dim=0)
+    right = right * torch.sign(right @ (rays[:, 0, -1] - rays[:, 0, 0]))
+    down = down * torch.sign(down @ (rays[:, -1, 0] - rays[:, 0, 0]))
+    down = F.normalize(down - (down @ right) * right, dim=0)
+    return torch.stack([right, down, torch.linalg.cross(right, down)], dim=1).to(directions.dtype)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanonicalFrame:
+    """The similarity world -> canonical: ``x' = rotation @ (x - center) / scale``; directions are only rotated."""
+
+    rotation: Float[Tensor, "3 3"]
+    """World-to-canonical rotation."""
+    center: Float[Tensor, "3"]
+    """World point that becomes the origin (the reference camera's centre)."""
+    scale: float
+    """World length that becomes 1."""
+
+    @staticmethod
+    def of(cameras: Pinholes, *, reference: int = 0, heading_radians: float = 0.0, fill: float = 1.0) -> CanonicalFrame:
+        """The frame of ``cameras[reference]`` (reference facts, section 3.6).
+
+        Args:
+            cameras: the cameras with known poses, any units.
+            reference: the camera that goes to the origin, upright.
+            heading_radians: rotation about the canonical z axis (training draws it, inference uses 0).
+            fill: for captures that already fit into the cube: 1 fills the cube, 0 leaves the scale alone (training draws it).
+        """
+        return CanonicalFrame._around(
+            cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians=heading_radians, fill=fill
+        )
+
+    @staticmethod
+    def of_raymaps(
+        raymaps: Float[Tensor, "n 6 h w"], *, reference: int = 0, heading_radians: float = 0.0, fill: float = 1.0
+    ) -> CanonicalFrame:
+        """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
+        rotation = axes_of(raymaps[reference, 3:])
+        centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
+        return CanonicalFrame._around(rotation, centers[reference], centers, heading_radians=heading_radians, fill=fill)
+
+    @staticmethod
+    def _around(
+        rotation_camera: Float[Tensor, "3 3"], center: Float[Tensor, "3"], centers: Float[Tensor, "n 3"], *, heading_radians: float, fill: float
+    ) -> CanonicalFrame:
+        """The frame that is upright in one camera and holds all centres."""
+        axes = rotation_camera.double()
+        flip = axes.new_tensor([1.0, -1.0, -1.0]).diag()  # OpenCV axes to y up, z backward
+        upright = axes.new_tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # +90 degrees about x: y up -> z up
+        cosine, sine = math.cos(heading_radians), math.sin(heading_radians)
+        turn = axes.new_tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        rotation = turn @ upright @ flip @ axes.T
+        extent = float(((centers.double() - center.double()) @ rotation.T).abs().max())
+        if not math.isfinite(extent):
+            raise ValueError("canonical frame: a camera pose holds NaN or infinity; expected finite camera_to_world matrices")
+        scale = extent if extent >= 1.0 else extent * fill + (1.0 - fill)
+        if scale == 0.0:  # every camera in one place: any scale is right, 1 keeps it invertible
+            scale = 1.0
+        return CanonicalFrame(rotation=rotation.to(rotation_camera.dtype), center=center, scale=scale * (1.0 + _SCALE_MARGIN))
+
+    def apply(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+        """World raymaps to canonical ones (origins in [-1, 1]^3 for the cameras the frame was made from)."""
+        origins = torch.einsum("ij,njhw->nihw", self.rotation, raymaps[:, :3] - self.center[:, None, None]) / self.scale
+        return torch.cat([origins, torch.einsum("ij,njhw->nihw", self.rotation, raymaps[:, 3:])], dim=1)
+
+    def invert(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+        """Canonical raymaps back to the world: the exact inverse of :meth:`apply`."""
+        origins = torch.einsum("ji,njhw->nihw", self.rotation, raymaps[:, :3] * self.scale) + self.center[:, None, None]
+        return torch.cat([origins, torch.einsum("ji,njhw->nihw", self.rotation, raymaps[:, 3:])], dim=1)

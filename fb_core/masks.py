@@ -1,0 +1,67 @@
+"""Known-masks (1 = known): the training mixture, conditioning dropout, growing a hole, scaling to the latent grid."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rotated_rectangle(height: int, width: int, *, center: tuple[float, float], size: tuple[float, float], angle_radians: float) -> Tensor:
+    """1 inside a rotated rectangle, 0 outside, tested at the pixel centres; center (y, x) and size (h, w) in pixels. Shape [h, w]."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5 - center[0], torch.arange(width) + 0.5 - center[1], indexing="ij")
+    along = x * math.cos(angle_radians) + y * math.sin(angle_radians)
+    across = -x * math.sin(angle_radians) + y * math.cos(angle_radians)
+    return ((along.abs() <= size[1] / 2) & (across.abs() <= size[0] / 2)).float()
+
+
+def partly_known(height: int, width: int, *, generator: torch.Generator) -> Float[Tensor, "1 h w"]:
+    """A mask with 2 to 10 unknown rotated rectangles of 10 to 50 % of the image's side (paper, "Masking out regions")."""
+    known = torch.ones(height, width)
+    for _ in range(int(torch.randint(2, 11, (), generator=generator))):
+        size_y, size_x, y, x, turn = torch.rand(5, generator=generator).tolist()
+        size = ((0.1 + 0.4 * size_y) * height, (0.1 + 0.4 * size_x) * width)
+        known *= 1 - rotated_rectangle(height, width, center=(y * height, x * width), size=size, angle_radians=2 * math.pi * turn)
+    return known[None]
+
+
+def training_mixture(
+    count: int, height: int, width: int, *, generator: torch.Generator, known: int | None = None, unknown: int | None = None
+) -> Float[Tensor, "n 1 h w"]:
+    """Masks of one training sequence: by default a quarter of the views known, half unknown, the rest partly known, in random order.
+
+    ``known`` and ``unknown`` override the two counts (the released code's split is n//4 and n//2).
+    """
+    known = count // 4 if known is None else known
+    unknown = count // 2 if unknown is None else unknown
+    if known + unknown > count:
+        raise ValueError(f"training mixture: {known} known and {unknown} unknown views do not fit into {count} views")
+    masks = torch.zeros(count, 1, height, width)
+    order = torch.randperm(count, generator=generator)
+    masks[order[:known]] = 1.0
+    for view in order[known + unknown :].tolist():
+        masks[view] = partly_known(height, width, generator=generator)
+    return masks
+
+
+def drop_conditioning(generator: torch.Generator, *, share: float = 0.1) -> tuple[bool, bool]:
+    """(drop images, drop rays): with probability ``share`` something is dropped, equally images, rays, or both (paper, appendix)."""
+    if float(torch.rand((), generator=generator)) >= share:
+        return False, False
+    which = int(torch.randint(0, 3, (), generator=generator))
+    return which in (0, 2), which in (1, 2)
+
+
+def grow_hole(known: Float[Tensor, "n 1 h w"], *, pixels: int) -> Float[Tensor, "n 1 h w"]:
+    """The mask with its unknown region grown by ``pixels`` in the maximum norm (the NeRFiller protocol uses 5)."""
+    if pixels <= 0:
+        return known
+    return 1 - F.max_pool2d(1 - known, kernel_size=2 * pixels + 1, stride=1, padding=pixels)
+
+
+def to_latent_grid(known: Float[Tensor, "n 1 h w"], *, factor: int = 8) -> Float[Tensor, "n 1 lh lw"]:
+    """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples of ``factor``."""
+    return F.avg_pool2d(known, kernel_size=factor)
