@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from dataclasses import dataclass
 
 import torch
@@ -31,8 +32,8 @@ class Pinholes:
 
     def __getitem__(self, index) -> Pinholes:
         """The chosen cameras; an integer keeps the leading dimension (one camera)."""
-        if isinstance(index, int):
-            index = [index]
+        if isinstance(index, numbers.Integral):  # NumPy's integers too
+            index = [int(index)]
         return dataclasses.replace(
             self, camera_to_world=self.camera_to_world[index], focal=self.focal[index], principal=self.principal[index]
         )
@@ -126,19 +127,32 @@ class Pinholes:
 
     @staticmethod
     def looking_at(
-        centers: Float[Tensor, "n 3"], targets: Float[Tensor, "n 3"], *, up: Float[Tensor, "3"], fov_degrees: float, width: int, height: int
+        centers: Float[Tensor, "n 3"],
+        targets: Float[Tensor, "n 3"],
+        *,
+        up: Float[Tensor, " 3"],
+        fov_degrees: float,
+        width: int,
+        height: int,
     ) -> Pinholes:
         """Cameras at ``centers`` that look at ``targets`` with square pixels; ``fov_degrees`` spans the image width.
 
-        Where the view direction is (nearly) parallel to ``up``, any perpendicular axis serves as the right axis.
+        Where the view direction is (nearly) parallel to ``up``, some perpendicular axis serves as the right axis.
+        Raises ValueError for a target at its camera's centre and for a field of view outside (0, 180).
         """
-        forward = F.normalize(targets - centers, dim=-1)
-        right = torch.linalg.cross(forward, up.expand_as(forward))
-        substitute = torch.linalg.cross(forward, forward.roll(1, dims=-1) + forward.new_tensor([0.123, -0.456, 0.789]))
+        if not 0.0 < fov_degrees < 180.0:
+            raise ValueError(f"looking_at: expected fov_degrees between 0 and 180, got {fov_degrees}")
+        toward = targets.double() - centers.double()
+        distance = toward.norm(dim=-1, keepdim=True)
+        if not bool((distance > 0).all() and torch.isfinite(distance).all()):
+            raise ValueError("looking_at: expected finite targets apart from their centers, got one at its center or not finite; move it")
+        forward = toward / distance
+        right = torch.linalg.cross(forward, F.normalize(up.double(), dim=0).expand_as(forward))
+        other = F.one_hot(forward.abs().argmin(dim=-1), 3).to(forward)  # the world axis farthest from the view direction
         parallel = right.norm(dim=-1, keepdim=True) < 1e-6
-        right = F.normalize(torch.where(parallel, substitute, right), dim=-1)
+        right = F.normalize(torch.where(parallel, torch.linalg.cross(forward, other), right), dim=-1)
         down = torch.linalg.cross(forward, right)
-        rotation = torch.stack([right, down, forward], dim=-1)
+        rotation = torch.stack([right, down, forward], dim=-1).to(centers)
         focal = 0.5 * width / torch.tan(torch.deg2rad(centers.new_tensor(fov_degrees)) / 2)
         return Pinholes(
             camera_to_world=torch.cat([rotation, centers[:, :, None]], dim=2),

@@ -46,7 +46,7 @@ def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
     rays = directions.double()
     row_normals = [torch.linalg.cross(rays[:, row, 0], rays[:, row, -1]) for row in (0, -1)]
     column_normals = [torch.linalg.cross(rays[:, 0, column], rays[:, -1, column]) for column in (0, -1)]
-    # The plane normals of rows point down, those of columns left; crossing upper with lower (left with right) gives the axis up to its sign.
+    # Normals of rows point down, those of columns left; crossing upper with lower (left with right) gives the axis up to its sign.
     right = F.normalize(torch.linalg.cross(row_normals[0], row_normals[1]), dim=0)
     down = F.normalize(torch.linalg.cross(column_normals[0], column_normals[1]), dim=0)
     right = right * torch.sign(right @ (rays[:, 0, -1] - rays[:, 0, 0]))
@@ -55,13 +55,24 @@ def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
     return torch.stack([right, down, torch.linalg.cross(right, down)], dim=1).to(directions.dtype)
 
 
+def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """Files hold rounded rotations, but only a true one makes a frame with an exact inverse. Refuses what is no rotation at all."""
+    error = float((matrix.T @ matrix - torch.eye(3, dtype=matrix.dtype)).abs().max())
+    if not error < 1e-2 or float(torch.linalg.det(matrix)) < 0:
+        raise ValueError(
+            f"canonical frame: the reference camera's pose is singular, mirrored or scaled, expected a rotation, got {matrix.tolist()}"
+        )
+    left, _, right = torch.linalg.svd(matrix)
+    return left @ right
+
+
 @dataclass(frozen=True, kw_only=True)
 class CanonicalFrame:
     """The similarity world -> canonical: ``x' = rotation @ (x - center) / scale``; directions are only rotated."""
 
     rotation: Float[Tensor, "3 3"]
     """World-to-canonical rotation."""
-    center: Float[Tensor, "3"]
+    center: Float[Tensor, " 3"]
     """World point that becomes the origin (the reference camera's centre)."""
     scale: float
     """World length that becomes 1."""
@@ -76,9 +87,9 @@ class CanonicalFrame:
             heading_radians: rotation about the canonical z axis (training draws it, inference uses 0).
             fill: for captures that already fit into the cube: 1 fills the cube, 0 leaves the scale alone (training draws it).
         """
-        return CanonicalFrame._around(
-            cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians=heading_radians, fill=fill
-        )
+        if len(cameras) == 0:
+            raise ValueError("canonical frame: expected at least one camera, got none; pass the captured cameras")
+        return CanonicalFrame._around(cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians, fill)
 
     @staticmethod
     def of_raymaps(
@@ -87,26 +98,32 @@ class CanonicalFrame:
         """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
         rotation = axes_of(raymaps[reference, 3:])
         centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
-        return CanonicalFrame._around(rotation, centers[reference], centers, heading_radians=heading_radians, fill=fill)
+        return CanonicalFrame._around(rotation, centers[reference], centers, heading_radians, fill)
 
     @staticmethod
     def _around(
-        rotation_camera: Float[Tensor, "3 3"], center: Float[Tensor, "3"], centers: Float[Tensor, "n 3"], *, heading_radians: float, fill: float
+        rotation_camera: Float[Tensor, "3 3"],
+        center: Float[Tensor, " 3"],
+        all_centers: Float[Tensor, "n 3"],
+        heading_radians: float,
+        fill: float,
     ) -> CanonicalFrame:
-        """The frame that is upright in one camera and holds all centres."""
-        axes = rotation_camera.double()
+        """The frame that is upright in one camera and holds all centres. Reckoned in float64 on the CPU (a few numbers)."""
+        axes = _nearest_rotation(rotation_camera.detach().cpu().double())
+        centers = all_centers.detach().cpu().double()
         flip = axes.new_tensor([1.0, -1.0, -1.0]).diag()  # OpenCV axes to y up, z backward
         upright = axes.new_tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # +90 degrees about x: y up -> z up
         cosine, sine = math.cos(heading_radians), math.sin(heading_radians)
         turn = axes.new_tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         rotation = turn @ upright @ flip @ axes.T
-        extent = float(((centers.double() - center.double()) @ rotation.T).abs().max())
+        extent = float(((centers - center.detach().cpu().double()) @ rotation.T).abs().max())
         if not math.isfinite(extent):
-            raise ValueError("canonical frame: a camera pose holds NaN or infinity; expected finite camera_to_world matrices")
+            raise ValueError("canonical frame: a camera centre holds NaN or infinity; expected finite camera_to_world matrices")
+        rounding = 4 * torch.finfo(all_centers.dtype).eps * float(centers.abs().max())
         scale = extent if extent >= 1.0 else extent * fill + (1.0 - fill)
-        if scale == 0.0:  # every camera in one place: any scale is right, 1 keeps it invertible
+        if scale <= rounding:  # every camera in one place, up to rounding: any scale is right, but noise must not fill the cube
             scale = 1.0
-        return CanonicalFrame(rotation=rotation.to(rotation_camera.dtype), center=center, scale=scale * (1.0 + _SCALE_MARGIN))
+        return CanonicalFrame(rotation=rotation.to(rotation_camera), center=center, scale=scale * (1.0 + _SCALE_MARGIN))
 
     def apply(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
         """World raymaps to canonical ones (origins in [-1, 1]^3 for the cameras the frame was made from)."""

@@ -1,0 +1,373 @@
+"""Captures on disk: nerfstudio's ``transforms.json`` folder, read into our types and written back without loss.
+
+The file holds camera-to-world matrices with OpenGL axes (x right, y up, z backward); a :class:`Frame` holds OpenCV axes.
+Only the signs of two columns change, and the stored camera is float64 as JSON numbers are, so poses and intrinsics survive
+reading and writing bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.data import media
+from fb_core.data.points import Points, write_points
+from fb_core.data.transforms_json import (
+    DISTORTION_KEYS,
+    INTRINSIC_KEYS,
+    JSON_NAME,
+    camera_entry,
+    camera_from,
+    checked_pose,
+    finite_number,
+    load_transforms,
+    to_json,
+)
+from fb_core.data.undistort import check_lens, undistort
+from fb_core.geometry.cameras import Pinholes
+
+FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
+CAPTURE_KEYS = ("frames", "ply_file_path", *INTRINSIC_KEYS)
+_SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")  # lists of file_path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One picture of a capture with its camera. Pictures of one capture may differ in size and lens."""
+
+    image_path: Path
+    """The picture's file."""
+    mask_path: Path | None = None
+    """A grey picture of the same size: white = used; None = all of it."""
+    camera: Pinholes
+    """One camera, float64, OpenCV axes, in the capture's world; focal and principal before undistortion."""
+    distortion: dict[str, float] = field(default_factory=dict)
+    """Lens coefficients k1, k2, k3, k4, p1, p2 as far as they are given; empty = none."""
+    camera_model: str = "OPENCV"
+    """Name of the lens model as nerfstudio spells it."""
+    extra: dict[str, Any] = field(default_factory=dict)
+    """All other keys of the frame, as they stand in the file."""
+
+    def load_image(self) -> Float[Tensor, "3 h w"]:
+        """RGB in [0, 1] of the camera's size, bent as the lens bent it. Raises ValueError for a bad file or another size."""
+        return self._load()[0]
+
+    def load_mask(self) -> Float[Tensor, "1 h w"]:
+        """1 where the picture is to be used, else 0: mask file (lighter than half) and alpha channel (above half), all ones without."""
+        return self._load()[1]
+
+    def load_undistorted(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"], Pinholes]:
+        """Image, mask and camera without lens distortion (see :func:`fb_core.data.undistort.undistort`)."""
+        check_lens(self.camera_model, self.distortion, f"image {self.image_path}")
+        image, mask = self._load()
+        return undistort(image, mask, self.camera, self.camera_model, self.distortion)
+
+    def _load(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
+        # Posed pictures are counted in stored pixels (nerfstudio ignores the EXIF tag), unless only the upright size fits.
+        size = (self.camera.height, self.camera.width)
+        stored = media.image_size(self.image_path, apply_orientation=False)
+        upright = stored != size and media.image_size(self.image_path) == size
+        image, alpha = media.read_image_with_alpha(self.image_path, apply_orientation=upright)
+        if tuple(image.shape[1:]) != size:
+            raise ValueError(_wrong_size(self, "image", self.image_path, stored))
+        mask = torch.ones_like(image[:1]) if alpha is None else (alpha >= 0.5).to(image)
+        if self.mask_path is not None:
+            painted = media.read_image(self.mask_path, apply_orientation=upright)[:1]
+            if tuple(painted.shape[1:]) != size:
+                raise ValueError(_wrong_size(self, "mask", self.mask_path, tuple(painted.shape[1:])))
+            mask = mask * (painted >= 0.5)
+        return image.clamp(0, 1), mask
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """A folder of posed pictures."""
+
+    root: Path
+    """The folder; relative names in ``extra`` are relative to it."""
+    frames: tuple[Frame, ...]
+    """In the order of the file (nerfstudio sorts them by name)."""
+    points_path: Path | None = None
+    """A PLY file of coloured points in the capture's world."""
+    extra: dict[str, Any] = field(default_factory=dict)
+    """All other top-level keys (applied_transform, train_filenames, ...), as they stand in the file."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def cameras(self) -> Pinholes:
+        """All cameras in one batch. Raises ValueError when the pictures differ in size."""
+        return Pinholes.cat([frame.camera for frame in self.frames])
+
+    @property
+    def poses(self) -> Float[Tensor, "n 3 4"]:
+        """All camera-to-world matrices (OpenCV axes, float64), whatever the sizes."""
+        return torch.cat([frame.camera.camera_to_world for frame in self.frames])
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of every picture."""
+        return [(frame.camera.height, frame.camera.width) for frame in self.frames]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameToWrite:
+    """One undistorted picture for :func:`write_capture`."""
+
+    name: str
+    """Name of the files without folder and suffix; unique within the capture."""
+    image: Float[Tensor, "3 h w"]
+    """RGB in [0, 1]; stored with 8 bits."""
+    mask: Float[Tensor, "1 h w"] | None = None
+    """1 = used; values below one half become 0. None = all used."""
+    camera: Pinholes
+    """One camera of the image's size, OpenCV axes."""
+    extra: dict[str, Any] = field(default_factory=dict)
+    """Further JSON keys of the frame."""
+
+
+def read_capture(folder: str | Path) -> Capture:
+    """The capture in a folder with a transforms.json, or in the JSON file given.
+
+    Intrinsics may stand at the top (they win, as in nerfstudio) or in each frame; a focal may be given as camera_angle_x; a missing
+    size is taken from the picture. Pictures are not opened otherwise: see :func:`validate_capture`.
+
+    Raises:
+        ValueError: one sentence, for a missing folder or file, bad JSON, no frames, and bad or missing poses and intrinsics.
+    """
+    path = Path(folder)
+    if not path.exists():
+        raise ValueError(f"capture {path}: no such folder; check the path")
+    if path.is_dir():
+        path = path / JSON_NAME
+        if not path.is_file():
+            raise ValueError(f"capture {path.parent}: no {JSON_NAME} in this folder; run ns-process-data, or check the path")
+    meta = load_transforms(path)
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames:
+        got = "no frames" if frames in (None, []) else f"frames of type {type(frames).__name__}"
+        raise ValueError(f"capture {path}: expected a list 'frames' with at least one camera, got {got}; process the pictures again")
+    points = meta.get("ply_file_path")
+    if not (points is None or isinstance(points, str)):
+        raise ValueError(f"capture {path}: expected a file name for ply_file_path, got {points!r}; correct the file")
+    return Capture(
+        root=path.parent,
+        frames=tuple(_read_frame(path, index, entry, meta) for index, entry in enumerate(frames)),
+        points_path=None if points is None else path.parent / points,
+        extra={key: value for key, value in meta.items() if key not in CAPTURE_KEYS},
+    )
+
+
+def validate_capture(folder: str | Path, *, decode: bool = False) -> Capture:
+    """Reads a capture and checks all that ``ns-train`` needs, so that nothing fails halfway through a training.
+
+    Beyond :func:`read_capture`: every picture and mask exists, is complete, and has its camera's size in stored pixels; masks are given
+    for all frames or for none; the lens can be undistorted; the points file exists.
+
+    Args:
+        folder: the capture.
+        decode: also decode every picture (seconds instead of milliseconds for a hundred photos).
+
+    Raises:
+        ValueError: one sentence about the first fault found.
+    """
+    capture = read_capture(folder)
+    masked = sum(frame.mask_path is not None for frame in capture.frames)
+    if masked not in (0, len(capture)):
+        raise ValueError(f"capture {folder}: expected mask_path in all frames or in none, got {masked} of {len(capture)}; add white masks")
+    if capture.points_path is not None and not capture.points_path.is_file():
+        raise ValueError(f"capture {folder}: ply_file_path names {capture.points_path}, which is missing; restore it or remove the key")
+    for frame in capture.frames:
+        check_lens(frame.camera_model, frame.distortion, f"image {frame.image_path}")
+        for kind, path in (("image", frame.image_path), ("mask", frame.mask_path)):
+            if path is None:
+                continue
+            stored = media.image_size(path, apply_orientation=False)
+            if stored != (frame.camera.height, frame.camera.width):
+                raise ValueError(_wrong_size(frame, kind, path, stored))
+        if decode:
+            frame.load_image()
+    return capture
+
+
+def write_transforms(capture: Capture, folder: str | Path, *, overwrite: bool = False) -> Path:
+    """Writes the transforms.json of a capture into ``folder``; pictures stay where they are and are named relative to it.
+
+    Reading the result gives bit-equal poses, intrinsics and extras. Names of files among the extras (per-frame keys that end in
+    ``_path``, and the lists of train, val and test files) are re-expressed for the new folder. Returns the path of the JSON file.
+    """
+    folder = Path(folder)
+    target = folder / JSON_NAME
+    if target.exists() and not overwrite:
+        raise ValueError(f"write_transforms: {target} exists already; choose another folder or pass overwrite=True")
+
+    meta = dict(capture.extra)
+    for key in set(_SPLIT_KEYS) & set(meta):
+        meta[key] = [_relative(capture.root / name, folder) for name in meta[key]]
+    models = {frame.camera_model for frame in capture.frames}
+    if len(models) == 1:  # nerfstudio looks for it at the top only
+        meta["camera_model"] = next(iter(models))
+    if capture.points_path is not None:
+        meta["ply_file_path"] = _relative(capture.points_path, folder)
+    meta["frames"] = [_frame_entry(frame, capture.root, folder, with_model=len(models) > 1) for frame in capture.frames]
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished = folder / f".{JSON_NAME}.{os.getpid()}"
+    unfinished.write_text(to_json(meta, str(target)))
+    os.replace(unfinished, target)
+    return target
+
+
+def write_capture(
+    folder: str | Path,
+    frames: Sequence[FrameToWrite],
+    *,
+    points: Points | None = None,
+    extra: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> Capture:
+    """Writes a capture that nerfstudio's own reader takes as it is: images/NAME.png, masks/NAME.png, points3D.ply, transforms.json.
+
+    Masks are written for all frames as soon as one has a mask, because nerfstudio wants all or none. All is written beside the target
+    and then renamed, so the folder is there whole or not at all.
+
+    Args:
+        folder: where the capture goes; it may exist if it is empty.
+        frames: at least one, with names of their own.
+        points: coloured points in the world of the cameras.
+        extra: further top-level JSON keys, e.g. ``orientation_override``; values of plain JSON types.
+        overwrite: replace the capture that the folder holds now.
+
+    Returns:
+        The capture as :func:`read_capture` reads it.
+    """
+    folder, extra = Path(folder), extra or {}
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not overwrite:
+            raise ValueError(f"write_capture: {folder} exists and is not empty; choose another folder or pass overwrite=True")
+        if not (folder / JSON_NAME).is_file():  # never sweep away a folder that is something else
+            raise ValueError(f"write_capture: {folder} holds other things than a capture (no {JSON_NAME}); choose another folder")
+    _check_to_write(frames, extra)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = folder.parent / f".{folder.name}.{secrets.token_hex(4)}"
+    unfinished.mkdir()
+    try:
+        written = tuple(_write_frame(frame, unfinished, any(one.mask is not None for one in frames)) for frame in frames)
+        if points is not None:
+            write_points(unfinished / "points3D.ply", points)
+        points_path = None if points is None else unfinished / "points3D.ply"
+        write_transforms(Capture(root=unfinished, frames=written, points_path=points_path, extra=extra), unfinished)
+        _put_in_place(unfinished, folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return read_capture(folder)
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any]) -> Frame:
+    where = f"capture {json_path}, frame {index}"
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise ValueError(f"{where}: expected an object with a 'file_path', got {str(entry)[:80]}; process the pictures again")
+    where += f" ({entry['file_path']})"
+    image_path = json_path.parent / entry["file_path"]
+    lens = shared if any(key in shared for key in DISTORTION_KEYS) else entry
+    mask = entry.get("mask_path")
+    if not (mask is None or isinstance(mask, str)):
+        raise ValueError(f"{where}: expected a file name for mask_path, got {mask!r}; correct the file")
+    return Frame(
+        image_path=image_path,
+        mask_path=None if mask is None else json_path.parent / mask,
+        camera=camera_from(where, image_path, entry, shared),
+        distortion={key: finite_number(where, lens, key) for key in DISTORTION_KEYS if key in lens},
+        camera_model=str(shared.get("camera_model", entry.get("camera_model", "OPENCV"))),
+        extra={key: value for key, value in entry.items() if key not in FRAME_KEYS},
+    )
+
+
+def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, int]) -> str:
+    height, width = frame.camera.height, frame.camera.width
+    told = f"{kind} {path}: expected {width} x {height} pixels as its camera says, got {stored[1]} x {stored[0]}"
+    if stored == (width, height) and media.image_size(path) == (height, width):
+        return f"{told} stored lying on the side (EXIF orientation), which nerfstudio does not turn; save the picture upright"
+    return f"{told}; resize the {kind}, or process the pictures again"
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """The file's name seen from a folder; links are followed only where the way leads out of the folder."""
+    plain = os.path.relpath(path, folder)
+    return os.path.relpath(path.parent.resolve() / path.name, folder.resolve()) if plain.startswith("..") else plain
+
+
+def _frame_entry(frame: Frame, root: Path, folder: Path, *, with_model: bool) -> dict[str, Any]:
+    """The JSON object of one frame."""
+    entry: dict[str, Any] = {"file_path": _relative(frame.image_path, folder)}
+    if frame.mask_path is not None:
+        entry["mask_path"] = _relative(frame.mask_path, folder)
+    if with_model:
+        entry["camera_model"] = frame.camera_model
+    files = {key: value for key, value in frame.extra.items() if key.endswith("_path") and isinstance(value, str)}
+    moved = {key: _relative(root / value, folder) for key, value in files.items()}
+    return {**entry, **frame.distortion, **frame.extra, **moved, **camera_entry(frame.camera)}
+
+
+def _check_to_write(frames: Sequence[FrameToWrite], extra: dict[str, Any]) -> None:
+    if not frames:
+        raise ValueError("write_capture: expected at least one frame, got none")
+    if taken := sorted(set(extra) & set(CAPTURE_KEYS)):
+        raise ValueError(f"write_capture: extra must not hold {taken}, which are written from the frames and points; rename them")
+    names = [frame.name for frame in frames]
+    for frame in frames:
+        where = f"write_capture, frame {frame.name!r}"
+        if not frame.name or frame.name.startswith(".") or "/" in frame.name or "\\" in frame.name or names.count(frame.name) > 1:
+            raise ValueError(f"{where}: expected a file name of its own without folder or leading dot; rename it")
+        size = (frame.camera.height, frame.camera.width)
+        sizes = [tuple(frame.image.shape[1:])] + ([] if frame.mask is None else [tuple(frame.mask.shape[1:])])
+        if len(frame.camera) != 1 or any(one != size for one in sizes):
+            raise ValueError(f"{where}: expected one camera and image and mask of its (height, width) {size}, got {sizes}; resize them")
+        if taken := sorted(set(frame.extra) & set(FRAME_KEYS)):
+            raise ValueError(f"{where}: extra must not hold {taken}, which are written from the camera and files; rename them")
+        checked_pose(where, frame.camera.camera_to_world[0].tolist())
+        values = torch.cat([frame.camera.focal[0], frame.camera.principal[0]])
+        if not bool(torch.isfinite(values).all() and (frame.camera.focal > 0).all()):
+            raise ValueError(f"{where}: expected a finite focal above 0 and a finite principal point, got {values.tolist()}")
+
+
+def _write_frame(frame: FrameToWrite, folder: Path, with_mask: bool) -> Frame:
+    """Writes the pictures of one frame; returns the frame that names them."""
+    image_path, mask_path = folder / "images" / f"{frame.name}.png", folder / "masks" / f"{frame.name}.png"
+    image_path.parent.mkdir(exist_ok=True)
+    media.write_image(image_path, frame.image)
+    if with_mask:
+        mask_path.parent.mkdir(exist_ok=True)
+        mask = torch.ones_like(frame.image[:1]) if frame.mask is None else frame.mask
+        media.write_image(mask_path, (mask >= 0.5).to(frame.image))
+    return Frame(image_path=image_path, mask_path=mask_path if with_mask else None, camera=frame.camera, extra=frame.extra)
+
+
+def _put_in_place(finished: Path, folder: Path) -> None:
+    """Renames a finished folder to its name; what was there is moved aside first and removed last."""
+    if not folder.exists():
+        os.replace(finished, folder)
+        return
+    aside = finished.with_name(f"{finished.name}.old")
+    os.replace(folder, aside)
+    try:
+        os.replace(finished, folder)
+    except OSError:
+        os.replace(aside, folder)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

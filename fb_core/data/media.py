@@ -1,0 +1,271 @@
+"""Still images in and out: files on one side, float tensors (3 h w, range [0, 1]) on the other.
+
+OpenImageIO does the decoding and is imported on first use. Orientation tags of phones (EXIF) are honoured. Every reader
+raises ``ValueError`` with one sentence for a file that is missing, empty, cut short, or not an image.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from jaxtyping import Float
+from torch import Tensor
+
+_HEIF_SUFFIXES = (".heic", ".heif")
+_MARKER_IN_JPEG_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # stuffed zeros, fill bytes and restarts are no markers
+
+
+def read_image(path: str | Path, *, apply_orientation: bool = True) -> Float[Tensor, "3 h w"]:
+    """The colours of a still image, upright.
+
+    Args:
+        path: JPEG, PNG, TIFF, EXR, WebP, ... (HEIC with the extra ``heic``); grey becomes three equal channels.
+        apply_orientation: turn the pixels as the EXIF tag says; False gives them as stored.
+
+    Returns:
+        RGB. Integer files (8 or 16 bit) are scaled to [0, 1]; float files come as they are stored.
+    """
+    return read_image_with_alpha(path, apply_orientation=apply_orientation)[0]
+
+
+def read_image_with_alpha(
+    path: str | Path, *, apply_orientation: bool = True
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"] | None]:
+    """Like :func:`read_image`, with the alpha channel (1 = opaque) or None where the file has none.
+
+    The colours are not multiplied by alpha (except in EXR files, whose definition wants it so).
+    """
+    path = _checked_file(path)
+    pixels, names, orientation = _decode_heif(path) if path.suffix.lower() in _HEIF_SUFFIXES else _decode(path)
+    if apply_orientation:
+        pixels = _upright(pixels, orientation)
+    alpha = pixels[names.index("A")][None] if "A" in names else None
+    if {"R", "G", "B"} <= set(names):
+        return pixels[[names.index(name) for name in "RGB"]], alpha
+    luminance = [index for index, name in enumerate(names) if name in ("Y", "I", "L")] or ([0] if len(names) == 1 else [])
+    if not luminance:
+        raise ValueError(f"image {path}: expected channels R, G, B or one grey channel, got {names}; read it with read_exr")
+    return repeat(pixels[luminance[0]], "h w -> channels h w", channels=3), alpha
+
+
+def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int, int]:
+    """(height, width) in pixels, upright, from the file's header and its end (a file cut short is refused); nothing is decoded."""
+    path = _checked_file(path)
+    if path.suffix.lower() in _HEIF_SUFFIXES:
+        width, height = _pillow_heif(path).open_heif(path).size
+        return height, width
+    reader = _opened(path)
+    spec = reader.spec()
+    height, width, orientation = spec.height, spec.width, spec.get_int_attribute("Orientation", 1)
+    reader.close()
+    return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
+
+
+def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
+    """Writes colours (3 channels) or grey (1 channel); the suffix chooses the format.
+
+    Values are clipped to [0, 1] and rounded to ``bits`` (8 or 16; JPEG knows 8 only). EXR keeps float32 as given.
+    """
+    path = Path(path)
+    if image.shape[0] not in (1, 3) or image.shape[1] == 0 or image.shape[2] == 0:
+        raise ValueError(f"write_image {path}: expected an image of shape (3 or 1, height, width), got {tuple(image.shape)}")
+    if bits not in (8, 16):
+        raise ValueError(f"write_image {path}: expected bits 8 or 16, got {bits}")
+    if path.suffix.lower() == ".exr":
+        names = "RGB" if image.shape[0] == 3 else "Y"
+        write_exr(path, {name: image[index] for index, name in enumerate(names)})
+        return
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError(f"write_image {path}: the image holds NaN or infinity, expected values in [0, 1]; write an .exr to keep them")
+    top = 2**bits - 1
+    attributes = {"Compression": "jpeg:95", "jpeg:subsampling": "4:4:4"} if path.suffix.lower() in (".jpg", ".jpeg") else {}
+    integers = (image.detach().cpu().double().clamp(0, 1) * top).round().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+    _encode(path, rearrange(integers, "c h w -> h w c"), None, attributes)
+
+
+def write_exr(path: str | Path, channels: Mapping[str, Float[Tensor, "h w"]]) -> None:
+    """Writes named float32 channels of one size, losslessly compressed (for raymaps, depth, normals)."""
+    sizes = {tuple(channel.shape) for channel in channels.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"write_exr {path}: expected at least one channel and one size for all of them, got sizes {sorted(sizes)}")
+    stacked = torch.stack([channel.detach().cpu().float() for channel in channels.values()], dim=-1).numpy()
+    _encode(Path(path), stacked, list(channels), {"Compression": "zip"})
+
+
+def read_exr(path: str | Path, names: list[str] | None = None) -> dict[str, Float[Tensor, "h w"]]:
+    """The named float channels of an EXR file (all of them by default). The order inside the file does not matter."""
+    path = _checked_file(path)
+    pixels, stored, _ = _decode(path)
+    missing = [name for name in names or [] if name not in stored]
+    if missing:
+        raise ValueError(f"read_exr {path}: channels {missing} are not in the file, which has {stored}; ask for those")
+    return {name: pixels[stored.index(name)] for name in (stored if names is None else names)}
+
+
+def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tensor, "c height width"]:
+    """The image at another size, antialiased (a triangle as wide as the larger of both pixels); corners stay corners.
+
+    Constants stay constant and no value leaves the input's range. The camera that belongs to the result is
+    ``camera.scaled(width, height)``.
+    """
+    if height < 1 or width < 1:
+        raise ValueError(f"resize: expected a height and a width of at least 1 pixel, got {height} and {width}")
+    if tuple(image.shape[1:]) == (height, width):
+        return image
+    return F.interpolate(image[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False)[0]
+
+
+# ---- decoding -------------------------------------------------------------------------------------------------------
+
+
+def _checked_file(path: str | Path) -> Path:
+    """The path of a file that exists, is not empty, and does not stop in the middle (as far as its container tells)."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"image {path}: no such file; check the path")
+    if path.stat().st_size == 0:
+        raise ValueError(f"image {path}: the file is empty (0 bytes), expected an image; copy it again from its source")
+    with path.open("rb") as file:
+        start = file.read(16)
+        complete = True
+        if start[:3] == b"\xff\xd8\xff":
+            complete = _jpeg_is_complete(file)
+        elif start[:8] == b"\x89PNG\r\n\x1a\n":
+            complete = _png_is_complete(file)
+        elif start[:4] == b"RIFF" and start[8:12] == b"WEBP":
+            complete = path.stat().st_size >= 8 + int.from_bytes(start[4:8], "little")
+    if not complete:
+        raise ValueError(f"image {path}: the file is truncated (it ends before the image does); copy it again from its source")
+    return path
+
+
+def _jpeg_is_complete(file) -> bool:
+    """Whether the first image's end marker is there. Decoders only warn and paint the missing part grey.
+
+    A file that ends with the marker is taken at its word; others (phones append previews and films) are walked through.
+    """
+    file.seek(-2, os.SEEK_END)
+    if file.read(2) == b"\xff\xd9":
+        return True
+    file.seek(0)
+    data, position = file.read(), 2
+    while position + 4 <= len(data):
+        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
+        if data[position] != 0xFF:
+            return True  # not the structure we know: the decoder shall judge
+        if marker == 0xD9:
+            return True
+        if marker == 0xFF:  # a fill byte before a marker
+            position += 1
+            continue
+        position += 2 + length
+        if marker == 0xDA:  # entropy-coded data follows this header, up to the next marker
+            found = _MARKER_IN_JPEG_SCAN.search(data, position)
+            if found is None:
+                return False
+            position = found.start()
+    return data[position : position + 2] == b"\xff\xd9"
+
+
+def _png_is_complete(file) -> bool:
+    """Whether the chunks follow each other up to the end chunk; only their headers are read."""
+    size = file.seek(0, os.SEEK_END)
+    position = 8
+    while position + 12 <= size:
+        file.seek(position)
+        header = file.read(8)
+        position += 12 + int.from_bytes(header[:4], "big")  # length, name, data, checksum
+        if header[4:] == b"IEND":
+            return True
+    return False
+
+
+def _opened(path: Path):
+    """An OpenImageIO reader that leaves colours unmultiplied by alpha."""
+    import OpenImageIO as oiio
+
+    settings = oiio.ImageSpec()
+    settings.attribute("oiio:UnassociatedAlpha", 1)
+    reader = oiio.ImageInput.open(str(path), settings)
+    if reader is None:
+        raise ValueError(f"image {path}: not readable as an image ({_one_line(oiio.geterror())}); expected JPEG, PNG, TIFF, EXR or WebP")
+    return reader
+
+
+def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
+    """Pixels as stored (float32), the channels' names, and the orientation tag (1 = upright)."""
+    import OpenImageIO as oiio
+
+    reader = _opened(path)
+    spec = reader.spec()
+    kind = oiio.UINT8 if spec.format == oiio.TypeUInt8 else oiio.FLOAT
+    array = reader.read_image(0, 0, 0, spec.nchannels, kind)
+    error = reader.geterror()
+    reader.close()
+    if array is None or error:
+        raise ValueError(f"image {path}: damaged or truncated ({_one_line(error)}); copy it again from its source")
+    pixels = rearrange(torch.from_numpy(np.ascontiguousarray(array)), "h w c -> c h w")
+    pixels = pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
+    return pixels.contiguous(), list(spec.channelnames), spec.get_int_attribute("Orientation", 1)
+
+
+def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
+    """Like :func:`_decode` for HEIC photos; their decoder turns them upright itself."""
+    try:
+        image = _pillow_heif(path).open_heif(path)
+        array = np.asarray(image)
+    except (OSError, RuntimeError, SyntaxError) as error:
+        raise ValueError(f"image {path}: not readable as HEIC ({_one_line(str(error))}); convert it to JPEG") from error
+    pixels = rearrange(torch.from_numpy(np.array(array)), "h w c -> c h w")
+    return pixels.float() / 255, list(image.mode), 1
+
+
+def _pillow_heif(path: Path):
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise ValueError(
+            f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install 'fillerbuster[heic]' or convert to JPEG"
+        ) from error
+    return pillow_heif
+
+
+def _upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, "c h2 w2"]:
+    """The pixels turned as an EXIF orientation (1 to 8; anything else counts as 1) asks for."""
+    if orientation in (5, 6, 7, 8):
+        pixels = pixels.transpose(1, 2)
+    flips = {2: [2], 3: [1, 2], 4: [1], 6: [2], 7: [1, 2], 8: [1]}.get(orientation, [])
+    return pixels.flip(flips).contiguous()
+
+
+# ---- encoding -------------------------------------------------------------------------------------------------------
+
+
+def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: dict[str, str]) -> None:
+    """Writes (h, w, c) integers or floats as they are."""
+    import OpenImageIO as oiio
+
+    height, width, count = array.shape
+    writer = oiio.ImageOutput.create(str(path))
+    if writer is None:
+        raise ValueError(f"cannot write {path}: no image format has the suffix {path.suffix!r}; use .png, .jpg or .exr")
+    kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
+    spec = oiio.ImageSpec(width, height, count, kinds[array.dtype.name])
+    if names is not None:
+        spec.channelnames = names
+    for key, value in attributes.items():
+        spec.attribute(key, value)
+    done = writer.open(str(path), spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()
+    if not done:
+        raise ValueError(f"cannot write {path} ({_one_line(writer.geterror())}); check that the folder exists and has room")
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split()) or "no reason given"

@@ -1,0 +1,42 @@
+"""Coloured points and the PLY file that nerfstudio seeds its splats from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points:
+    """Coloured points of a scene."""
+
+    positions: Float[Tensor, "m 3"]
+    """World coordinates, scene units."""
+    colors: Float[Tensor, "m 3"]
+    """RGB in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        if self.positions.shape != self.colors.shape or self.positions.ndim != 2 or self.positions.shape[1] != 3:
+            raise ValueError(
+                f"Points: expected positions and colors of shape (m, 3), got {tuple(self.positions.shape)} and {tuple(self.colors.shape)}"
+            )
+        if not bool(torch.isfinite(self.positions).all() and torch.isfinite(self.colors).all()):
+            raise ValueError("Points: positions or colors hold NaN or infinity, expected finite numbers; drop those points")
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+
+def write_points(path: str | Path, points: Points) -> None:
+    """Writes a binary PLY file: float32 positions and 8-bit colours (red, green, blue)."""
+    vertices = np.empty(len(points), dtype=[("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"] = points.positions.detach().cpu().float().numpy()
+    vertices["color"] = (points.colors.detach().cpu().double().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    properties = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {color}" for color in ("red", "green", "blue")]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    Path(path).write_bytes("\n".join(lines).encode("ascii") + vertices.tobytes())

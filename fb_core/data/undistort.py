@@ -1,0 +1,92 @@
+"""Straight pictures from lenses that bend: undistortion with OpenCV's lens models (the models that nerfstudio trains on)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+
+PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+
+
+def check_lens(camera_model: str, distortion: dict[str, float], where: str) -> None:
+    """Raises ValueError for a lens that cannot be undistorted; ``where`` opens the sentence."""
+    if camera_model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
+        known = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise ValueError(f"{where}: camera_model {camera_model!r} is not supported, expected one of {known}; undistort the images first")
+    if camera_model in PERSPECTIVE_MODELS and distortion.get("k4", 0.0) != 0.0:
+        k4 = distortion["k4"]
+        raise ValueError(f"{where}: {camera_model} with k4 = {k4:g}, expected only k1, k2, k3, p1, p2; undistort the images first")
+
+
+def undistort(
+    image: Float[Tensor, "3 h w"], mask: Float[Tensor, "1 h w"], camera: Pinholes, camera_model: str, distortion: dict[str, float]
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"], Pinholes]:
+    """The picture that a pinhole camera of the same pose and size would have taken.
+
+    Args:
+        image: colours as the lens bent them.
+        mask: 1 = known.
+        camera: one camera of the image's size; focal and principal of the lens.
+        camera_model: a name of nerfstudio's ``camera_model``.
+        distortion: any of k1, k2, k3, k4, p1, p2; missing ones are 0.
+
+    Returns:
+        Image, mask, camera. The new focal keeps only what the lens saw (no empty border, up to a pixel's rounding); what lies outside
+        the lens's picture, and every pixel that touches an unknown one, is unknown.
+    """
+    check_lens(camera_model, distortion, "undistort")
+    if not any(distortion.values()):
+        return image, mask, camera
+    import cv2
+
+    straight, to_bent = (_fisheye_map if camera_model in FISHEYE_MODELS else _perspective_map)(camera, distortion)
+    colours = torch.where(mask > 0, image, torch.zeros_like(image))  # unknown colours may be anything, NaN included
+    bent = rearrange(torch.cat([colours, mask]), "c h w -> h w c").contiguous().numpy()
+    result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    result = rearrange(torch.from_numpy(result), "h w c -> c h w")
+    return result[:3].contiguous(), (result[3:] > 1 - 1e-4).to(mask.dtype), straight
+
+
+def _matrix(camera: Pinholes) -> np.ndarray:
+    """K as OpenCV counts pixels: the centre of the first pixel is 0, ours is 0.5."""
+    matrix = camera.intrinsics[0].double().numpy().copy()
+    matrix[:2, 2] -= 0.5
+    return matrix
+
+
+def _with_matrix(camera: Pinholes, matrix: np.ndarray) -> Pinholes:
+    values = torch.from_numpy(np.asarray(matrix, dtype=np.float64))
+    focal, principal = torch.stack([values[0, 0], values[1, 1]])[None], values[None, :2, 2] + 0.5
+    return dataclasses.replace(camera, focal=focal.to(camera.focal), principal=principal.to(camera.principal))
+
+
+def _perspective_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pinholes, tuple[np.ndarray, np.ndarray]]:
+    """Brown's model: the pinhole camera, and for each of its pixels the place in the bent picture."""
+    import cv2
+
+    coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    size = (camera.width, camera.height)
+    matrix = _matrix(camera)
+    straight, _ = cv2.getOptimalNewCameraMatrix(matrix, coefficients, size, 0)
+    maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, straight, size, cv2.CV_32FC1)
+    return _with_matrix(camera, straight), maps
+
+
+def _fisheye_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pinholes, tuple[np.ndarray, np.ndarray]]:
+    """The equidistant model with four coefficients; otherwise like :func:`_perspective_map`."""
+    import cv2
+
+    coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
+    size = (camera.width, camera.height)
+    matrix = _matrix(camera)
+    straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(matrix, coefficients, size, np.eye(3), balance=0)
+    maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), straight, size, cv2.CV_32FC1)
+    return _with_matrix(camera, straight), maps
