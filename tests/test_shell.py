@@ -66,9 +66,7 @@ def test_few_points_give_a_sphere_at_their_median_distance_and_none_the_fallback
     few = fit_shell(CENTER + directions(5) * torch.tensor([1.0, 2.0, 3.0, 4.0, 50.0])[:, None], center=CENTER, fallback_radius=9.0)
     assert torch.allclose(few.radius(directions(20)), torch.tensor(3.0), atol=1e-5)
     for nothing in (torch.empty(0, 3), torch.full((4, 3), torch.nan), CENTER[None]):
-        assert torch.allclose(
-            fit_shell(nothing, center=CENTER, fallback_radius=9.0).radius(directions(20)), torch.tensor(9.0), atol=1e-4
-        )
+        assert torch.allclose(fit_shell(nothing, center=CENTER, fallback_radius=9.0).radius(directions(20)), torch.tensor(9.0), atol=1e-4)
 
 
 def test_a_radius_that_is_no_length_is_refused():

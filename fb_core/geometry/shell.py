@@ -97,9 +97,7 @@ def fit_shell(
     return Shell(center=center, log_radius=table.reshape(_ROWS, _COLUMNS))
 
 
-def intersect(
-    shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], *, samples: int = 48
-) -> Float[Tensor, "n"]:
+def intersect(shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], *, samples: int = 48) -> Float[Tensor, "n"]:
     """Distance along each ray to where it first passes from the shell's inside to its outside.
 
     A ray that starts inside always has such a point. One that starts outside may enter first; if it never does, the
