@@ -1,0 +1,353 @@
+"""Front-to-back alpha compositing of screen ellipses, by cells of 8x8 pixels, with an analytic gradient.
+
+Inside a cell, with (u, v) a pixel's offset from the cell centre, the exponent of a Gaussian is a quadratic polynomial:
+
+    log(opacity) - d^T conic d / 2  =  k0 + k1 u + k2 v + k3 u^2 + k4 u v + k5 v^2
+
+so a block of B ranks x S cells x 64 pixels is one thin matrix product with the 6x64 matrix of monomials, one exp, and
+B in-place multiplications for the transmittance. Blocks hold a bounded number of pairs and stay in the cache; cells whose
+pixels are all opaque drop out. The backward pass walks the same blocks front to back again (nothing is stored): what lies
+behind a Gaussian is the known total less what has been passed. The gradient of a pair is its derivative g by the exponent;
+the sums of g times monomials (again one product with the 6x64 matrix) give the moments from which every gradient follows.
+
+Rules per pixel (gsplat): skip alpha < 1/255; cap alpha; stop before the Gaussian that would bring the transmittance to
+1e-4 or below. A pair above the cap passes no gradient to its exponent. The exponent of a positive definite conic is never
+positive, so gsplat's test for sigma < 0 only ever rejects rounding noise and is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float, Int32
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from fb_nerfstudio.single_thread import single_thread
+from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses, Strips, list_cells, measure_strips, slabs
+from fb_nerfstudio.torch_projection import ALPHA_MIN
+
+TRANSMITTANCE_MIN = 1e-4
+PAIRS_PER_BLOCK = 2**17
+ROWS_PER_LIST = 2**20
+_NEVER = -1e4
+_TERMS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompositingSettings:
+    """What the compositor needs besides tensors."""
+
+    alpha_cap: float
+    """Largest alpha of one pair."""
+    absgrad: bool = False
+    """Whether backward leaves the sum over pixels of |d loss / d mean2d| in `means2d.absgrad`."""
+    pairs_per_block: int = PAIRS_PER_BLOCK
+    """Pairs (Gaussian, pixel) worked on at once: bounds the scratch memory and should fit the cache."""
+    rows_per_list: int = ROWS_PER_LIST
+    """Pairs (Gaussian, cell) listed at once: bounds the memory of the lists."""
+
+
+def composite(
+    means2d: Float[Tensor, "c n 2"],
+    conics: Float[Tensor, "c n 3"],
+    opacities: Float[Tensor, "c n"],
+    values: Float[Tensor, "v d"],
+    chosen: Int32[Tensor, " v"],
+    ellipses: Ellipses,
+    grid: CellGrid,
+    settings: CompositingSettings,
+) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
+    """Images of the values, and alpha = 1 - transmittance.
+
+    `chosen` holds the flat indices (camera * n + Gaussian) of the Gaussians that may be seen, nearest first; `values` and
+    `ellipses` are given for these rows only. Gradients flow to means2d, conics, opacities and values.
+    """
+    return _Composite.apply(means2d, conics, opacities, values, chosen, ellipses, grid, settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    """Columns of the chosen Gaussians, and the constants of the grid."""
+
+    ellipses: Ellipses
+    log_opacity: Tensor
+    values: Float[Tensor, "v d1"]
+    """With a last channel of ones, which composites to alpha."""
+    monomials: Float[Tensor, "6 p"]
+    center_x: Tensor
+    center_y: Tensor
+    threshold: float
+    """The largest number below 1/255."""
+    cap: float | None
+    """None where no opacity exceeds it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Block:
+    """B ranks deep, S cells wide, P pixels each; index order (b, s)."""
+
+    depth: int
+    cells: Tensor
+    splats: Int32[Tensor, " bs"]
+    """Rows of the table; padding points at some row and has alpha 0."""
+    dx: Tensor
+    dy: Tensor
+    """Mean less cell centre."""
+    alpha: Float[Tensor, "b s p"]
+    before: Float[Tensor, "b s p"]
+    """Transmittance in front of each."""
+    capped: Tensor | None
+    """Pairs at the cap (bool), or None where there are none."""
+
+
+class _Scratch:
+    """Reused buffers: fresh allocations of this size would cost page faults at every block."""
+
+    def __init__(self, like: Tensor):
+        self._like = like
+        self._buffers: dict[str, Tensor] = {}
+
+    def take(self, name: str, *shape: int) -> Tensor:
+        size = 1
+        for length in shape:
+            size *= length
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.numel() < size:
+            buffer = self._buffers[name] = self._like.new_empty(size)
+        return buffer[:size].view(shape)
+
+
+def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
+    """1, u, v, u^2, u v, v^2 at the pixels of a cell, row by row."""
+    offsets = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
+    v, u = (grid.reshape(-1) for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
+    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])
+
+
+def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _Table:
+    below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
+    center_x, center_y = grid.centers(values)
+    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
+    may_cap = ellipses.opacity.numel() > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
+    return _Table(
+        ellipses=ellipses,
+        log_opacity=ellipses.opacity.log(),
+        values=torch.cat([values, torch.ones_like(values[:, :1])], dim=1),
+        monomials=_monomials(grid.size, values),
+        center_x=center_x,
+        center_y=center_y,
+        threshold=float(below),
+        cap=cap if may_cap else None,
+    )
+
+
+def _coefficients(table: _Table, splats: Tensor, cells: Tensor, padding: Tensor, scratch: _Scratch) -> tuple[Tensor, Tensor, Tensor]:
+    """The polynomials [6, b s] of the listed Gaussians around their cells' centres, and mean less centre."""
+    ellipses = table.ellipses
+    shape = padding.shape
+    k = scratch.take("coefficients", _TERMS, splats.numel())
+    A, B, C = (column.index_select(0, splats) for column in (ellipses.A, ellipses.B, ellipses.C))
+    dx = ellipses.x.index_select(0, splats).view(shape).sub_(table.center_x.index_select(0, cells)).view(-1)
+    dy = ellipses.y.index_select(0, splats).view(shape).sub_(table.center_y.index_select(0, cells)).view(-1)
+    torch.mul(A, dx, out=k[1]).addcmul_(B, dy)
+    torch.mul(B, dx, out=k[2]).addcmul_(C, dy)
+    torch.index_select(table.log_opacity, 0, splats, out=k[0])
+    k[0].addcmul_(dx, k[1], value=-0.5).addcmul_(dy, k[2], value=-0.5)
+    k[0].masked_fill_(padding.view(-1), _NEVER)
+    torch.mul(A, -0.5, out=k[3])
+    torch.neg(B, out=k[4])
+    torch.mul(C, -0.5, out=k[5])
+    return k, dx, dy
+
+
+def _march(table: _Table, lists: CellLists, transmittance: Tensor, scratch: _Scratch, budget: int) -> Iterator[_Block]:
+    """All blocks, front to back in every cell; `transmittance` [cells, p] is advanced in place."""
+    pixels = table.monomials.shape[1]
+    busy = torch.argsort(lists.counts, descending=True, stable=True)
+    busy = busy[: int((lists.counts > 0).sum())]
+    for cells in busy.split(max(1, budget // (8 * pixels))):
+        counts, starts, rank = lists.counts.index_select(0, cells), lists.starts.index_select(0, cells), 0
+        while cells.numel():
+            width = cells.numel()
+            most = 64 if width * pixels >= 1024 else 1024
+            depth = min(max(8, budget // (width * pixels)), most, int(counts[0]) - rank)
+            ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=cells.device)[:, None]
+            padding = ranks >= counts
+            listed = (starts + ranks).masked_fill_(padding, 0).view(-1)
+            splats = lists.splats.index_select(0, listed)
+            k, dx, dy = _coefficients(table, splats, cells, padding, scratch)
+            alpha = scratch.take("alpha", depth * width, pixels)
+            torch.mm(k.t(), table.monomials, out=alpha)
+            F.threshold_(alpha.exp_(), table.threshold, 0.0)
+            alpha, capped = alpha.view(depth, width, pixels), None
+            if table.cap is not None:
+                capped = alpha > table.cap
+                capped = capped if bool(capped.any()) else None
+                alpha.clamp_(max=table.cap)
+            light = scratch.take("light", depth + 1, width, pixels)
+            torch.index_select(transmittance, 0, cells, out=light[0])
+            _multiply_through(alpha, light)
+            after = light[depth]
+            if float(after.min()) <= TRANSMITTANCE_MIN:
+                drawn = torch.threshold(light[1:], TRANSMITTANCE_MIN, 0.0).mul_(1e30).clamp_(max=1.0)
+                alpha.mul_(drawn)
+            transmittance.index_copy_(0, cells, after)
+            rank += depth
+            kept = (counts > rank) & (after.amax(dim=1) > TRANSMITTANCE_MIN)
+            yield _Block(depth=depth, cells=cells, splats=splats, dx=dx, dy=dy, alpha=alpha, before=light[:depth], capped=capped)
+            if not bool(kept.all()):
+                remaining = kept.nonzero()[:, 0]
+                cells, counts, starts = (column.index_select(0, remaining) for column in (cells, counts, starts))
+
+
+def _multiply_through(alpha: Tensor, light: Tensor) -> None:
+    """light[b + 1] = light[b] (1 - alpha[b]), in place."""
+    depth = alpha.shape[0]
+    passed = torch.sub(1.0, alpha, out=light[1:])
+    if light[0].numel() < 1024:  # thin blocks: one scan beats many tiny calls
+        torch.cumprod(light, dim=0, out=light)
+        return
+    for b in range(depth):
+        passed[b].mul_(light[b])
+
+
+def _forward_block(block: _Block, table: _Table, image: Tensor, scratch: _Scratch) -> None:
+    depth, width, pixels = block.alpha.shape
+    weights = torch.mul(block.alpha, block.before, out=scratch.take("weights", depth, width, pixels))
+    values = table.values.index_select(0, block.splats).view(depth, width, -1)
+    image.index_add_(0, block.cells, torch.bmm(values.permute(1, 2, 0), weights.permute(1, 0, 2)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sums:
+    """Gradients collected by Gaussian of the table."""
+
+    moments: Float[Tensor, "6 v"]
+    """Sums of g times 1, dx, dy, dx^2, dx dy, dy^2, with d = mean - pixel."""
+    values: Float[Tensor, "v d1"]
+    absolute: Float[Tensor, "2 v"] | None
+    """Sums of |d loss / d mean2d| by pixel."""
+
+
+def _backward_block(block: _Block, table: _Table, upstream: Tensor, behind: Tensor, sums: _Sums, scratch: _Scratch) -> None:
+    """Add the block's gradients; `behind` [cells, p], the part of the loss that lies behind, is advanced in place."""
+    depth, width, pixels = block.alpha.shape
+    arriving = upstream.index_select(0, block.cells)
+    weights = torch.mul(block.alpha, block.before, out=scratch.take("weights", depth, width, pixels))
+    by_cell = block.splats.view(depth, width).t().reshape(-1)
+    v_values = torch.bmm(weights.permute(1, 0, 2), arriving.transpose(1, 2))
+    sums.values.index_add_(0, by_cell, v_values.view(depth * width, -1))
+    values = table.values.index_select(0, by_cell).view(width, depth, -1)
+    seen = torch.bmm(values, arriving, out=scratch.take("seen", width, depth, pixels))
+    share = weights.mul_(seen.permute(1, 0, 2))
+    rest = scratch.take("rest", depth, width, pixels)
+    front = behind.index_select(0, block.cells)
+    for b in range(depth):
+        front = torch.sub(front, share[b], out=rest[b])
+    behind.index_copy_(0, block.cells, front)
+    # d loss / d exponent = alpha T (value . upstream) - alpha / (1 - alpha) * what lies behind
+    ratio = torch.sub(1.0, block.alpha, out=scratch.take("seen", depth, width, pixels))
+    g = share.addcmul_(torch.div(block.alpha, ratio, out=ratio), rest, value=-1.0)
+    if block.capped is not None:
+        g.masked_fill_(block.capped, 0.0)
+    g = g.view(depth * width, pixels)
+    _add_moments(block, torch.mm(table.monomials, g.t()), sums.moments)
+    if sums.absolute is not None:
+        _add_absolute(block, table, g, sums.absolute, scratch)
+
+
+def _add_moments(block: _Block, local: Tensor, moments: Tensor) -> None:
+    """Shift the moments about the cell centre, sums of g times monomials of (u, v), to d = (dx - u, dy - v), and add them."""
+    m, mu, mv, muu, muv, mvv = local.unbind(0)
+    dx, dy = block.dx, block.dy
+    mx, my = dx * m - mu, dy * m - mv
+    mxx = (dx * (mx - mu)).add_(muu)
+    mxy = (dx * my).addcmul_(dy, mu, value=-1.0).add_(muv)
+    myy = (dy * (my - mv)).add_(mvv)
+    moments.index_add_(1, block.splats, torch.stack([m, mx, my, mxx, mxy, myy]))
+
+
+def _add_absolute(block: _Block, table: _Table, g: Tensor, absolute: Tensor, scratch: _Scratch) -> None:
+    """|d loss / d mean2d| of a pixel is |g| |conic d|, and conic d is linear in (u, v)."""
+    A, B, C = (column.index_select(0, block.splats) for column in (table.ellipses.A, table.ellipses.B, table.ellipses.C))
+    size = g.abs_()
+    for axis, (p, q) in enumerate(((A, B), (B, C))):
+        line = torch.stack([(p * block.dx).addcmul_(q, block.dy), -p, -q])
+        pull = torch.mm(line.t(), table.monomials[:3], out=scratch.take("rest", *g.shape))
+        absolute[axis].index_add_(0, block.splats, pull.abs_().mul_(size).sum(dim=1))
+
+
+def _lists(ellipses: Ellipses, strips: Strips, grid: CellGrid, budget: int, transmittance: Tensor) -> Iterator[CellLists]:
+    """The lists slab by slab, without the cells that the slabs before have made opaque."""
+    for run in slabs(strips, budget):
+        alive = (transmittance.amax(dim=1) > TRANSMITTANCE_MIN) if run[0] else None
+        yield list_cells(ellipses, strips, run, grid, alive)
+
+
+def _to_image(cells: Tensor, grid: CellGrid) -> Tensor:
+    """[cells, d, p] -> [c, h, w, d]."""
+    shape = dict(c=grid.cameras, r=grid.rows, k=grid.columns, y=grid.size)
+    return rearrange(cells, "(c r k) d (y x) -> c (r y) (k x) d", **shape)[:, : grid.height, : grid.width]
+
+
+def _to_cells(image: Tensor, grid: CellGrid) -> Tensor:
+    """[c, h, w, d] -> [cells, d, p]; pixels beyond the border hold zeros."""
+    right, below = grid.columns * grid.size - grid.width, grid.rows * grid.size - grid.height
+    padded = F.pad(image, (0, 0, 0, right, 0, below)) if right or below else image
+    return rearrange(padded, "c (r y) (k x) d -> (c r k) d (y x)", y=grid.size, x=grid.size).contiguous()
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, values, chosen, ellipses: Ellipses, grid: CellGrid, settings: CompositingSettings):
+        with single_thread():
+            table, strips, scratch = _table(ellipses, values, grid, settings.alpha_cap), measure_strips(ellipses, grid), _Scratch(values)
+            pixels = grid.size * grid.size
+            image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
+            transmittance = values.new_ones(grid.count, pixels)
+            for lists in _lists(ellipses, strips, grid, settings.rows_per_list, transmittance):
+                for block in _march(table, lists, transmittance, scratch, settings.pairs_per_block):
+                    _forward_block(block, table, image, scratch)
+            out = _to_image(image, grid)
+            colors, alphas = out[..., :-1].contiguous(), out[..., -1:].contiguous()
+        ctx.save_for_backward(means2d, conics, opacities, values, chosen, image)
+        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
+        return colors, alphas
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_colors, v_alphas):
+        means2d, conics, opacities, values, chosen, image = ctx.saved_tensors
+        ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
+        with single_thread():
+            table, scratch = _table(ellipses, values, grid, settings.alpha_cap), _Scratch(values)
+            upstream = _to_cells(torch.cat([v_colors, v_alphas], dim=-1), grid)
+            behind = (image * upstream).sum(dim=1)
+            transmittance = torch.ones_like(behind)
+            number = values.shape[0]
+            sums = _Sums(
+                moments=values.new_zeros(_TERMS, number),
+                values=torch.zeros_like(table.values),
+                absolute=values.new_zeros(2, number) if settings.absgrad else None,
+            )
+            for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
+                for block in _march(table, lists, transmittance, scratch, settings.pairs_per_block):
+                    _backward_block(block, table, upstream, behind, sums, scratch)
+            m, mx, my, mxx, mxy, myy = sums.moments.unbind(0)
+            A, B, C = ellipses.A, ellipses.B, ellipses.C
+
+            def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
+                flat = like.new_zeros(means2d.shape[0] * means2d.shape[1], len(columns))
+                return flat.index_copy_(0, chosen.long(), torch.stack(columns, dim=1)).view(like.shape)
+
+            if sums.absolute is not None:
+                means2d.absgrad = dense(means2d, list(sums.absolute.unbind(0)))
+            v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
+            v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
+            v_opacities = dense(opacities, [m / ellipses.opacity])
+        return v_means2d, v_conics, v_opacities, sums.values[:, :-1], None, None, None, None
