@@ -207,5 +207,3 @@ def _sorted_lists(owner: Tensor, base: Tensor, widths: Tensor, grid: CellGrid, a
     counts = torch.bincount(cell, minlength=grid.count).int()
     starts = counts.cumsum(0, dtype=torch.int32) - counts
     return CellLists(splats=splat.index_select(0, order), starts=starts, counts=counts)
-
-

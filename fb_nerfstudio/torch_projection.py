@@ -271,9 +271,7 @@ def _screen(means: Tensor, shape: _Shape, viewmat: Tensor, lens: _Lens, eps2d: f
 
 def _through(rows: Tensor, matrix: Tensor) -> Tensor:
     """rows [2, 3, n] times matrix [3, 3, n] -> [2, 3, n], Gaussian by Gaussian."""
-    return torch.stack(
-        [(row[0] * matrix[0]).addcmul_(row[1], matrix[1]).addcmul_(row[2], matrix[2]) for row in rows.unbind(0)]
-    )
+    return torch.stack([(row[0] * matrix[0]).addcmul_(row[1], matrix[1]).addcmul_(row[2], matrix[2]) for row in rows.unbind(0)])
 
 
 def _compensation(screen: _Screen, floor: float) -> Tensor:
@@ -348,7 +346,10 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_means2d, v_conics, v_depths, v_compensations, _radii, _determinants):
         means, quats, scales, covars, viewmats, radii = ctx.saved_tensors
-        totals = [torch.zeros_like(t) if t is not None and wanted else None for t, wanted in zip((means, quats, scales, covars, viewmats), ctx.needs_input_grad[:5], strict=True)]
+        totals = [
+            torch.zeros_like(t) if t is not None and wanted else None
+            for t, wanted in zip((means, quats, scales, covars, viewmats), ctx.needs_input_grad[:5], strict=True)
+        ]
         incoming = (v_means2d, v_conics, v_depths, v_compensations)
         if all(gradient is None for gradient in incoming):
             return (*totals, None, None, None, None)
@@ -427,9 +428,7 @@ def _camera_backward(chosen, viewmat: Tensor, lens: _Lens, settings: ProjectionS
 def _point_gradient(screen: _Screen, v_ground: Tensor, rotation: Tensor, lens: _Lens, v_means2d: Tensor | None, v_depths: Tensor | None):
     """Gradients of the camera points [3, n] and of the rotation inside G [3, 3]."""
     jx, jxz, jy, jyz = screen.jacobian
-    v_rotation = torch.stack(
-        [v_ground[0] @ jx, v_ground[1] @ jy, v_ground[0] @ jxz + v_ground[1] @ jyz]
-    )
+    v_rotation = torch.stack([v_ground[0] @ jx, v_ground[1] @ jy, v_ground[0] @ jxz + v_ground[1] @ jyz])
     v_jx, v_jy = rotation[0] @ v_ground[0], rotation[1] @ v_ground[1]
     v_jxz, v_jyz = rotation[2] @ v_ground[0], rotation[2] @ v_ground[1]
     over_z = screen.z.reciprocal()

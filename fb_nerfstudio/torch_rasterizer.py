@@ -244,7 +244,9 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgr
         if not 0 <= sh_degree <= MAX_DEGREE:
             raise ValueError(f"sh_degree should be 0 to {MAX_DEGREE} but is {sh_degree}.")
         if colors.shape[-1] != 3 or colors.shape[-2] < (sh_degree + 1) ** 2:
-            raise ValueError(f"colors should hold at least {(sh_degree + 1) ** 2} x 3 coefficients for sh_degree {sh_degree} but has shape {tuple(colors.shape)}.")
+            raise ValueError(
+                f"colors should hold at least {(sh_degree + 1) ** 2} x 3 coefficients for sh_degree {sh_degree} but has shape {tuple(colors.shape)}."
+            )
     if backgrounds is not None:
         _expect("backgrounds", backgrounds, (cameras, colors.shape[-1]), means)
 
