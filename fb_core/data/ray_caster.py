@@ -94,7 +94,7 @@ def _safe(values: Tensor) -> Tensor:
 
 
 def _first_hits(table: _Table, origins: Float[Tensor, "b v q 3"], directions: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Distance and table row of the first surface on each ray ([b, v, r] both). ``q`` is 1 (a shared origin) or ``r``; directions by axis."""
+    """Distance and table row ([b, v, r] both) of the first surfaces. ``q`` is 1 (a shared origin) or ``r``; directions come by axis."""
     column = table.solids.transpose(1, 2)[:, :, None, :, None]  # [b 9 1 p 1]
     ox, oy, oz = (origins[..., axis].unsqueeze(2) - column[:, axis] for axis in range(3))  # [b v p q]
     cosine, sine = column[:, 6], column[:, 7]

@@ -102,17 +102,22 @@ class Joiner:
     def box(self, center: tuple, size: tuple, finish: Material) -> Solid:
         """An upright box of full ``size`` whose ``center`` gives x, y and the height of its underside."""
         half = tuple(extent / 2 for extent in size)
-        return Solid(kind="box", center=(center[0], center[1], center[2] + half[2]), half=half, material=finish)
+        return Solid(kind="box", center=(float(center[0]), float(center[1]), center[2] + half[2]), half=half, material=finish)
 
     def drum(self, center: tuple, radius: float, height: float, finish: Material) -> Solid:
         """A vertical cylinder; ``center`` gives x, y and the height of its underside."""
         return Solid(
-            kind="cylinder", center=(center[0], center[1], center[2] + height / 2), half=(radius, radius, height / 2), material=finish
+            kind="cylinder",
+            center=(float(center[0]), float(center[1]), center[2] + height / 2),
+            half=(radius, radius, height / 2),
+            material=finish,
         )
 
     def ball(self, center: tuple, radius: float, finish: Material) -> Solid:
         """A sphere about ``center``."""
-        return Solid(kind="sphere", center=center, half=(radius, radius, radius), material=finish)
+        return Solid(
+            kind="sphere", center=(float(center[0]), float(center[1]), float(center[2])), half=(radius, radius, radius), material=finish
+        )
 
     def cabinet(self) -> list[Solid]:
         """A sideboard or wardrobe."""
@@ -188,9 +193,9 @@ class Joiner:
         """A framed picture at eye height."""
         width, height = self.rng.uniform(0.5, 1.2), self.rng.uniform(0.4, 0.8)
         art = material(
-            self.rng, colour(self.rng, (0, 1), (0.2, 0.7), (0.3, 0.9)), contrast=0.2 + self.contrast, busyness=0.3 + 0.7 * self.busyness
+            self.rng, colour(self.rng, (0.0, 1.0), (0.2, 0.7), (0.3, 0.9)), contrast=0.2 + self.contrast, busyness=0.3 + 0.7 * self.busyness
         )
-        frame = Material(base=colour(self.rng, (0.05, 0.1), (0.0, 0.5), (0.1, 0.9)), second=(0, 0, 0))
+        frame = Material(base=colour(self.rng, (0.05, 0.1), (0.0, 0.5), (0.1, 0.9)), second=(0.0, 0.0, 0.0))
         level = self.rng.uniform(1.3, 1.55) - height / 2
         return [
             self.box((0, 0.01, level - 0.04), (width + 0.08, 0.02, height + 0.08), frame),

@@ -74,7 +74,8 @@ FAMILIES = {
         ),
         RoomFamily(
             name="wide", side_metres=(3.0, 8.0), height_metres=(2.3, 3.6), pieces=(3, 8), furniture=_ALL_FURNITURE, wall_pieces=(2, 6),
-            contrast=0.4, busyness=1.0, accent_odds=0.5, camera_reach=0.9, camera_height_metres=(0.6, 2.1), pitch_degrees=18.0, steep_odds=0.25,
+            contrast=0.4, busyness=1.0, accent_odds=0.5, camera_reach=0.9, camera_height_metres=(0.6, 2.1),
+            pitch_degrees=18.0, steep_odds=0.25,
         ),
     )
 }  # fmt: skip
@@ -132,7 +133,7 @@ class Room:
 
     def clearance(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance in metres to the nearest surface: positive in free space, negative inside a solid or outside the room."""
-        local = _into_frames(points[None] - self.centers[:, None], self.headings[:, None])
+        local = _into_frames(points[None] - self.centers[:, None], self.headings)
         beyond = local.abs() - self.halves[:, None]
         box = beyond.clamp(min=0).norm(dim=-1) + beyond.amax(dim=-1).clamp(max=0)
         radial = torch.stack([local[..., :2].norm(dim=-1) - self.halves[:, None, 0], beyond[..., 2]], dim=-1)
@@ -173,9 +174,9 @@ class Room:
         return 2 * axis + (normals.gather(-1, axis[:, None])[:, 0] > 0)
 
 
-def _into_frames(vectors: Float[Tensor, "*b 3"], headings: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
+def _into_frames(vectors: Float[Tensor, "p n 3"], headings: Float[Tensor, "p"]) -> Float[Tensor, "p n 3"]:
     """World vectors in frames turned by ``headings`` about z."""
-    cosine, sine = torch.cos(headings), torch.sin(headings)
+    cosine, sine = torch.cos(headings)[:, None], torch.sin(headings)[:, None]
     x, y, z = vectors.unbind(-1)
     return torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)
 
@@ -192,7 +193,7 @@ def make_room(seed: int, family: RoomFamily) -> Room:
     if rng.random() < 0.3:
         solids.append(_rug(rng, size, joiner))
     solids.sort(key=lambda solid: KINDS.index(solid.kind))
-    shell = Solid(kind="box", center=(0, 0, size[2] / 2), half=tuple(s / 2 for s in size), material=shell_materials[0])
+    shell = Solid(kind="box", center=(0.0, 0.0, size[2] / 2), half=tuple(s / 2 for s in size), material=shell_materials[0])
     materials = [*shell_materials, *(solid.material for solid in solids)]
     solids = [shell, *solids]
     return Room(
@@ -221,18 +222,20 @@ def _material_tensors(materials: list[Material]) -> dict[str, Tensor]:
 def _shell_materials(rng: np.random.Generator, family: RoomFamily) -> list[Material]:
     """Four walls of one paint (perhaps one accent wall), a floor and a pale ceiling."""
     calm = 0.5 * family.busyness
-    paint = material(rng, colour(rng, (0, 1), (0.05, 0.4), (0.55, 0.92)), contrast=family.contrast, busyness=calm)
+    paint = material(rng, colour(rng, (0.0, 1.0), (0.05, 0.4), (0.55, 0.92)), contrast=family.contrast, busyness=calm)
     walls = []
     for _ in range(4):
         tint = rng.uniform(0.97, 1.03)
-        walls.append(dataclasses.replace(paint, base=tuple(min(1.0, c * tint) for c in paint.base), phases=tuple(rng.uniform(0, 6.28, 2))))
+        walls.append(
+            dataclasses.replace(paint, base=tuple(min(1.0, c * tint) for c in paint.base), phases=tuple(rng.uniform(0, 6.28, 2).tolist()))
+        )
     if rng.random() < family.accent_odds:
         accent = shifted(rng, paint.base, 0.2 + family.contrast)
         walls[rng.integers(4)] = material(rng, accent, contrast=family.contrast, busyness=family.busyness)
     if rng.random() < 0.6:
         boards = colour(rng, (0.05, 0.1), (0.25, 0.55), (0.35, 0.7))
     else:
-        boards = colour(rng, (0, 1), (0.0, 0.25), (0.3, 0.75))
+        boards = colour(rng, (0.0, 1.0), (0.0, 0.25), (0.3, 0.75))
     floor = material(rng, boards, contrast=family.contrast, busyness=family.busyness)
     ceiling_colour = colour(rng, (0.08, 0.15), (0.0, 0.08), (0.85, 0.98))
     ceiling = Material(base=ceiling_colour, second=ceiling_colour)
