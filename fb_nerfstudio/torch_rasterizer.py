@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from fb_nerfstudio.single_thread import single_thread
