@@ -14,7 +14,7 @@ import torch
 from hypothesis import settings
 
 # Installed before any test imports fb_core, so that every annotated function and dataclass checks its shapes.
-jaxtyping.install_import_hook("fb_core", "beartype.beartype")
+jaxtyping.install_import_hook("fb_core", "shape_checks.checked")
 
 torch.set_num_threads(min(2, torch.get_num_threads()))
 settings.register_profile("fillerbuster", deadline=None, derandomize=True, max_examples=25)
