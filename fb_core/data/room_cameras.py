@@ -28,10 +28,13 @@ def cameras_by_angles(
     return dataclasses.replace(cameras, focal=focal[:, None].expand(-1, 2).clone())
 
 
-def free_positions(room: Room, count: int, *, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Random positions of the family's camera zone that keep their distance from every surface (on the generator's device: CPU)."""
+def free_positions(room: Room, count: int, *, generator: torch.Generator, reach: float | None = None) -> Float[Tensor, "n 3"]:
+    """Random positions of the family's camera zone that keep their distance from every surface (on the generator's device: CPU).
+
+    ``reach`` replaces the family's: share of the half sides around the room's centre. Raises ValueError for a room without free places.
+    """
     family, size = room.family, room.size.cpu()
-    reach = family.camera_reach
+    reach = family.camera_reach if reach is None else reach
     low, high = family.camera_height_metres
     house = room.to("cpu")
     found, tries = torch.empty(0, 3), 0

@@ -32,7 +32,7 @@ COVERED_SHARE, UNCOVERED_SHARE = 0.8, 0.4
 """A view is covered from the first share upwards, uncovered up to the second; views between them are not held out."""
 
 _log = logging.getLogger(__name__)
-_GRID = 48  # covered shares are measured on at most this many pixels squared
+_GRID = 32  # covered shares are measured on at most this many pixels squared
 _POINTS_PER_CAPTURE = 6000  # pixels tried; those seen by two views become points
 _POINT_NOISE_METRES = 0.005
 
@@ -73,7 +73,7 @@ def casual_capture(seed: int, *, family: str = "narrow", views: int = 24, size: 
     room = make_room(seed, FAMILIES[family])
     generator = torch.Generator().manual_seed(seed)
     low, high = room.family.fov_degrees
-    fov_degrees = low + (high - low) * float(torch.rand((), generator=generator))
+    fov_degrees = float(_uniform(1, (low + high) / 2, high, generator))  # phones hold wide lenses
     cameras, first_heading, sweep = _walk(room, views, size, fov_degrees, generator)
     images = render(room, cameras, supersample=2)
     others, shares = _held_out(room, cameras, held_out, (first_heading, sweep), fov_degrees, generator)
@@ -98,11 +98,11 @@ def _walk(room: Room, views: int, size: int, fov_degrees: float, generator: torc
     sweep = math.radians(float(_uniform(1, 150.0, 200.0, generator)))
     progress = torch.linspace(0, 1, views)
     heading = first + sweep * progress + _uniform(views, -0.06, 0.06, generator)
-    pitch = 0.12 * torch.sin(2 * math.pi * (1.5 * progress + torch.rand(1, generator=generator))) + _uniform(views, -0.05, 0.05, generator)
-    reach = float(_uniform(1, 0.3, 0.5, generator))  # a body turning: the phone moves on an arc in front of the person
+    pitch = 0.2 * torch.sin(2 * math.pi * (1.5 * progress + torch.rand(1, generator=generator))) + _uniform(views, -0.05, 0.05, generator)
+    reach = float(_uniform(1, 0.2, 0.35, generator))  # a body turning: the phone moves on an arc in front of the person
     bob = 0.06 * torch.sin(2 * math.pi * (2 * progress + torch.rand(1, generator=generator)))
     for _ in range(200):
-        person = free_positions(room, 1, generator=generator)
+        person = free_positions(room, 1, generator=generator, reach=min(room.family.camera_reach, 0.4))
         steps = torch.stack([heading.cos() * reach, heading.sin() * reach, bob], dim=-1)
         centers = person + steps + 0.02 * torch.randn(views, 3, generator=generator)
         if bool((room.clearance(centers) >= CAMERA_CLEARANCE_METRES).all()):

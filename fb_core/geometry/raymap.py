@@ -26,7 +26,7 @@ def raymaps_of(cameras: Pinholes) -> Float[Tensor, "n 6 h w"]:
     return torch.cat([origins, directions], dim=1)
 
 
-def to_unit_range(raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+def to_unit_range(raymaps: Float[Tensor, "*n 6 h w"]) -> Float[Tensor, "*n 6 h w"]:
     """Canonical raymaps (origins and directions in [-1, 1]) to the [0, 1] range that the raymap VAE takes."""
     return raymaps / 2 + 0.5
 

@@ -61,10 +61,10 @@ class DiTConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "text_width", self.text_width or 0)
         for name in ("heads", "head_dim", "depth", "patch", "in_channels", "out_channels", "mlp_ratio"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)}.")
-        if self.text_width < 0:
-            raise ValueError(f"text_width: expected a width, or 0 for a network without text, got {self.text_width}.")
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)!r}.")
+        if not isinstance(self.text_width, int) or self.text_width < 0:
+            raise ValueError(f"text_width: expected a width, or 0 for a network without text, got {self.text_width!r}.")
         if self.width < 8 or self.width % 4:
             raise ValueError(f"heads * head_dim: expected a multiple of 4 of at least 8 (position embeddings), got {self.width}.")
         if self.index not in INDEX_MODES:
@@ -233,9 +233,7 @@ class DiT(nn.Module):
                 parameter.fill_(0.0 if name.endswith("bias") else 1.0)
                 continue
             std = parameter[0].numel() ** -0.5
-            if name.endswith(
-                ("norm1.linear.weight", "norm2.linear.weight", "norm3.linear.weight", "proj_out_1.weight", "proj_out_2.weight")
-            ):
+            if name.endswith((".linear.weight", "proj_out_1.weight", "proj_out_2.weight")):
                 std = 0.0
             elif name.endswith(("to_out.0.weight", "ff.net.2.weight")):
                 std /= math.sqrt(branches)

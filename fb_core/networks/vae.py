@@ -45,11 +45,11 @@ class VAEConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
-        if len(self.widths) != LEVELS or min(self.widths) < 1:
+        if len(self.widths) != LEVELS or not all(isinstance(width, int) and width > 0 for width in self.widths):
             raise ValueError(f"widths: expected {LEVELS} positive channel counts (spatial factor {self.factor}), got {self.widths}.")
         for name in ("in_channels", "latent_channels", "encoder_resnets", "decoder_resnets", "norm_groups"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)}.")
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)!r}.")
         if self.norm not in ("group", "none"):
             raise ValueError(f"norm: expected 'group' or 'none', got {self.norm!r}.")
         if self.padding not in ("zeros", "replicate"):

@@ -1,0 +1,256 @@
+"""Model folders: `config.json` (every architectural choice) beside one safetensors file per network; saved whole or not at all.
+
+`load` builds the networks without allocating them and maps the files into memory, so that a model costs its weights once.
+Parameter names are those of the released checkpoints, so `convert` renames nothing.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.released import read_released
+from fb_core.networks.text import TextEncoder
+from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.networks.weights import adopt, require_names, require_shapes, without_weights
+
+FORMAT_VERSION = 1
+RELEASED_LICENSE = "CC BY-NC 4.0"
+CONFIG_FILE = "config.json"
+PROMPT_FILE = "empty-prompt.safetensors"
+PROMPT_KEY = "embedding"
+WEIGHT_FILES = {"transformer": "transformer.safetensors", "image_vae": "image-vae.safetensors", "raymap_vae": "raymap-vae.safetensors"}
+"""File of each network, by its section in the configuration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """The architecture of a whole model."""
+
+    transformer: DiTConfig
+    """The diffusion transformer."""
+    image_vae: VAEConfig
+    """The autoencoder of images."""
+    raymap_vae: VAEConfig
+    """The autoencoder of raymaps."""
+
+    def __post_init__(self) -> None:
+        latents = self.image_vae.latent_channels + self.raymap_vae.latent_channels
+        expected = {"out_channels": latents, "in_channels": 2 * latents + 2}
+        for name, count in expected.items():
+            if getattr(self.transformer, name) != count:
+                raise ValueError(
+                    f"transformer.{name}: expected {count} for autoencoders with {latents} latent channels together, "
+                    f"got {getattr(self.transformer, name)}."
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loaded:
+    """A model read from its folder, in evaluation mode."""
+
+    dit: DiT
+    image_vae: VAE
+    raymap_vae: VAE
+    """Always in float32: origins and directions need more than half precision."""
+    config: ModelConfig
+    info: dict[str, Any] = field(default_factory=dict)
+    """How the model came to be: training command, seed, loss, source, licence; free of form."""
+    empty_prompt: Float[Tensor, "words t"] | None = None
+    """Text embedding of the empty prompt, where the folder has one."""
+
+
+def save(
+    folder: str | os.PathLike[str],
+    *,
+    dit: DiT,
+    image_vae: VAE,
+    raymap_vae: VAE,
+    info: dict[str, Any] | None = None,
+    empty_prompt: Float[Tensor, "words t"] | None = None,
+    dtype: torch.dtype | None = None,
+) -> Path:
+    """Write a model folder, replacing an earlier model there only once the new one is complete; returns the folder.
+
+    `dtype` converts the transformer and the image autoencoder (None keeps theirs); the raymap autoencoder is stored in float32.
+    `info` must be JSON. Raises ValueError if the folder holds anything that is not a model.
+    """
+    folder = Path(folder).resolve()
+    if folder.exists():
+        _refuse_foreign(folder)
+    config = ModelConfig(transformer=dit.config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
+    try:
+        text = json.dumps({"format_version": FORMAT_VERSION, **dataclasses.asdict(config), "info": info or {}}, indent=2, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"info: expected values that JSON can hold (no NaN, no tensors), but {error}.") from error
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.partial")
+    partial.mkdir()
+    try:
+        modules: dict[str, nn.Module] = {"transformer": dit, "image_vae": image_vae, "raymap_vae": raymap_vae}
+        for section, file in WEIGHT_FILES.items():
+            stored = torch.float32 if section == "raymap_vae" else dtype
+            state = modules[section].state_dict()
+            save_file({name: value.to(device="cpu", dtype=stored).contiguous() for name, value in state.items()}, partial / file)
+        if empty_prompt is not None:
+            save_file({PROMPT_KEY: empty_prompt.detach().float().cpu().contiguous()}, partial / PROMPT_FILE)
+        (partial / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
+        _swap(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return folder
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if not folder.is_dir():
+        raise ValueError(f"folder: expected a model folder or a new one, but {folder} is a file.")
+    foreign = sorted({entry.name for entry in folder.iterdir()} - {CONFIG_FILE, PROMPT_FILE, *WEIGHT_FILES.values()})
+    if foreign:
+        raise ValueError(f"folder: {folder} holds {foreign[0]!r}, which is not part of a model; choose an empty or new folder.")
+
+
+def _swap(partial: Path, folder: Path) -> None:
+    """Put the finished `partial` in the place of `folder`."""
+    if not folder.exists():
+        partial.rename(folder)
+        return
+    previous = partial.with_suffix(".previous")
+    folder.rename(previous)
+    partial.rename(folder)
+    shutil.rmtree(previous)
+
+
+def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> Loaded:
+    """Read a model folder onto a device.
+
+    `dtype` converts the transformer and the image autoencoder (None keeps the stored precision); the raymap autoencoder is always
+    float32. On the CPU, unconverted weights stay mapped files and are shared between processes. Raises ValueError, in one
+    sentence that names the culprit, for a missing folder or file, an invalid configuration, weights of another architecture,
+    a truncated file, and a precision that the device cannot compute.
+    """
+    folder = Path(folder)
+    config, info = read_config(folder)
+    if dtype is not None:
+        _require_precision(torch.device(device), dtype)
+    dit = without_weights(lambda: DiT(config.transformer))
+    image_vae = without_weights(lambda: VAE(config.image_vae))
+    raymap_vae = without_weights(lambda: VAE(config.raymap_vae))
+    _load_weights(dit, folder / WEIGHT_FILES["transformer"], device, dtype)
+    _load_weights(image_vae, folder / WEIGHT_FILES["image_vae"], device, dtype)
+    _load_weights(raymap_vae, folder / WEIGHT_FILES["raymap_vae"], device, torch.float32)
+    prompt = folder / PROMPT_FILE
+    embedding = _read_prompt(prompt, device) if prompt.exists() else None
+    return Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=config, info=info, empty_prompt=embedding)
+
+
+def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, Any]]:
+    """Architecture and info of a model folder, without touching its weights. Raises ValueError as `load` does."""
+    path = Path(folder) / CONFIG_FILE
+    if not path.parent.is_dir():
+        raise ValueError(f"folder: expected a model folder, but there is no folder {path.parent}.")
+    if not path.is_file():
+        raise ValueError(f"folder: {path.parent} is not a model folder because it has no {CONFIG_FILE}.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: expected JSON, but {error}.") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected a JSON object, got {type(content).__name__}.")
+    version = content.pop("format_version", None)
+    if version != FORMAT_VERSION:
+        raise ValueError(f"{path}: expected format_version {FORMAT_VERSION}, got {version}; this may be a newer model.")
+    info = content.pop("info", {})
+    require_names(str(path), WEIGHT_FILES, content)
+    sections: dict[str, Any] = {}
+    for name, kind in (("transformer", DiTConfig), ("image_vae", VAEConfig), ("raymap_vae", VAEConfig)):
+        if not isinstance(content[name], dict):
+            raise ValueError(f"{path}: expected section {name!r} to be an object, got {content[name]!r}.")
+        require_names(f"{path}, section {name!r}", (f.name for f in dataclasses.fields(kind)), content[name])
+        try:
+            sections[name] = kind(**content[name])
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}, section {name!r}: {error}") from error
+    try:
+        return ModelConfig(**sections), info
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _open(path: Path, device: torch.device | str):
+    if not path.is_file():
+        raise ValueError(f"folder: {path.parent} is incomplete because it has no {path.name}.")
+    try:
+        return safe_open(path, framework="pt", device=str(device))
+    except SafetensorError as error:
+        raise ValueError(f"{path}: truncated, or not a safetensors file ({error}).") from error
+
+
+def _read_prompt(path: Path, device: torch.device | str) -> Tensor:
+    with _open(path, device) as file:
+        require_names(str(path), [PROMPT_KEY], file.keys())
+        return file.get_tensor(PROMPT_KEY)
+
+
+def _load_weights(module: nn.Module, path: Path, device: torch.device | str, dtype: torch.dtype | None) -> None:
+    """Give a module without weights the tensors of a file; only a conversion copies, one tensor at a time."""
+    with _open(path, device) as file:
+        names = list(file.keys())
+        require_shapes(str(path), module, {name: tuple(file.get_slice(name).get_shape()) for name in names})
+        adopt(str(path), module, {name: file.get_tensor(name).to(dtype=dtype) for name in names})
+
+
+def _require_precision(device: torch.device, dtype: torch.dtype) -> None:
+    if not dtype.is_floating_point:
+        raise ValueError(f"dtype: expected a floating point type, got {dtype}.")
+    if device.type == "cpu" and dtype == torch.float16:
+        raise ValueError("dtype: float16 is not offered on the CPU, where it is slow and overflows; use bfloat16 or float32.")
+
+
+def model_hash(folder: str | os.PathLike[str]) -> str:
+    """Sixteen hexadecimal digits that stand for a model's architecture and stored weights; its info does not count."""
+    folder = Path(folder)
+    config, _ = read_config(folder)
+    digest = hashlib.sha256(json.dumps(dataclasses.asdict(config), sort_keys=True).encode())
+    for name in (*WEIGHT_FILES.values(), PROMPT_FILE):
+        path = folder / name
+        if name == PROMPT_FILE and not path.exists():
+            continue
+        if not path.is_file():
+            raise ValueError(f"folder: {folder} is incomplete because it has no {name}.")
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()[:16]
+
+
+def convert(
+    checkpoints: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    dtype: torch.dtype | None = None,
+    text_encoder: str | os.PathLike[str] | None = None,
+) -> Path:
+    """Turn the folder of released `.ckpt` files into a model folder; returns it.
+
+    `text_encoder` is a folder with the CLIP text model; with it, the embedding of the empty prompt is stored too, and multi-view use
+    needs CLIP no more. Raises ValueError as `networks.released.read_released` and `save` do.
+    """
+    released = read_released(checkpoints)
+    prompt = None
+    if text_encoder is not None:
+        prompt = TextEncoder.from_folder(text_encoder).encode([""])[0]
+    info = {"source": "converted from the authors' released checkpoints", "license": RELEASED_LICENSE}
+    return save(
+        output, dit=released.dit, image_vae=released.image_vae, raymap_vae=released.raymap_vae, info=info, empty_prompt=prompt, dtype=dtype
+    )

@@ -1,0 +1,39 @@
+"""Strict weights: a network takes a set of tensors exactly as named and shaped, or says which one does not fit."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+
+def require_names(where: str, expected: Iterable[str], got: Iterable[str]) -> None:
+    """Raise a ValueError that begins with `where` and names what is missing and what is unknown, unless there is neither."""
+    expected, got = set(expected), set(got)
+    problems = [
+        f"{kind} {', '.join(sorted(names)[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''}"
+        for kind, names in (("missing", expected - got), ("unknown", got - expected))
+        if names
+    ]
+    if problems:
+        raise ValueError(f"{where}: expected exactly the {len(expected)} names of this architecture, got {'; '.join(problems)}.")
+
+
+def require_shapes(where: str, module: nn.Module, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise a ValueError that begins with `where` and names the first misfit, unless `shapes` are those of the module's state."""
+    expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    require_names(where, expected, shapes)
+    for name, shape in expected.items():
+        if tuple(shapes[name]) != shape:
+            raise ValueError(f"{where}: expected {name} of shape {list(shape)}, got {list(shapes[name])}.")
+
+
+def without_weights(build: Callable[[], nn.Module]) -> nn.Module:
+    """The module that `build` makes, in evaluation mode and with parameters that occupy no memory until `adopt` gives them some."""
+    with torch.device("meta"):
+        return build().eval()
+
+
+def adopt(where: str, module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Make `tensors` (not copies of them) the module's parameters. Raises ValueError as `require_shapes` does."""
+    require_shapes(where, module, {name: tuple(value.shape) for name, value in tensors.items()})
+    module.load_state_dict(dict(tensors), strict=True, assign=True)

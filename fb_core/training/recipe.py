@@ -1,0 +1,150 @@
+"""A training recipe: three stages (image autoencoder, raymap autoencoder, transformer) that end in one model folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from fb_core import checkpoint
+from fb_core.conditioning import encode_in_chunks
+from fb_core.data.sequences import PoolConfig, RoomPool
+from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.training.dit_stage import DiTLossConfig, DiTStage
+from fb_core.training.loop import LoopConfig, OnProgress, Run
+from fb_core.training.vae_stage import VAELossConfig, VAEStage, reconstruction_error
+
+STAGES = ("image-vae", "raymap-vae", "dit")
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Everything that decides a model: architectures, data, losses, optimisation."""
+
+    name: str
+    """Name of the preset."""
+    image_vae: VAEConfig
+    """Architecture of the image autoencoder."""
+    raymap_vae: VAEConfig
+    """Architecture of the raymap autoencoder."""
+    dit: DiTConfig
+    """Architecture of the transformer."""
+    pool: PoolConfig
+    """Rooms to learn from."""
+    image_vae_loop: LoopConfig
+    """Optimisation of the image autoencoder."""
+    raymap_vae_loop: LoopConfig
+    """Optimisation of the raymap autoencoder."""
+    dit_loop: LoopConfig
+    """Optimisation of the transformer."""
+    image_vae_loss: VAELossConfig = VAELossConfig()
+    """Loss of the image autoencoder."""
+    raymap_vae_loss: VAELossConfig = VAELossConfig()
+    """Loss of the raymap autoencoder."""
+    dit_loss: DiTLossConfig = DiTLossConfig()
+    """Loss and task of the transformer."""
+    seed: int = 0
+    """Decides rooms, weights and every draw."""
+
+
+def run_stage(
+    recipe: Recipe,
+    stage: str,
+    folder: Path,
+    *,
+    device: torch.device | str = "cpu",
+    steps: int | None = None,
+    minutes: float = math.inf,
+    on_progress: OnProgress | None = None,
+) -> Run:
+    """Train one stage in ``folder/stage`` (resuming what is there). The transformer needs both autoencoders of the same folder.
+
+    Raises ValueError for an unknown stage, and for a transformer whose autoencoders are not there yet.
+    """
+    if stage not in STAGES:
+        raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")
+    if stage == "dit":
+        image_vae, raymap_vae = (trained_vae(recipe, kind, folder, device) for kind in STAGES[:2])
+        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, encode=lambda images: encode_in_chunks(image_vae, images, 64))
+        network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device)
+        task, loop = (
+            DiTStage(network, image_vae=image_vae, raymap_vae=raymap_vae, pool=pool, config=recipe.dit_loss, seed=recipe.seed),
+            recipe.dit_loop,
+        )
+    else:
+        config = recipe.image_vae if stage == "image-vae" else recipe.raymap_vae
+        loss = recipe.image_vae_loss if stage == "image-vae" else recipe.raymap_vae_loss
+        with torch.random.fork_rng():
+            torch.manual_seed(recipe.seed)
+            network = VAE(config).to(device)
+        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device)
+        task = VAEStage(network, pool, kind=stage, config=loss, seed=recipe.seed)
+        loop = recipe.image_vae_loop if stage == "image-vae" else recipe.raymap_vae_loop
+    run = Run(task, loop if steps is None else dataclasses.replace(loop, steps=steps), folder / stage)
+    run.train(on_progress=on_progress, minutes=minutes)
+    if isinstance(task, VAEStage):
+        _record_spread(task, run.averaged_state(), folder / stage)
+    return run
+
+
+def trained_vae(recipe: Recipe, kind: str, folder: Path, device: torch.device | str = "cpu") -> VAE:
+    """The averaged weights of an autoencoder stage, scaled so that its latents have unit variance (flow matching starts from N(0, 1))."""
+    network, _ = _trained_vae(recipe, kind, folder)
+    return network.to(device).eval().requires_grad_(False)
+
+
+def _trained_vae(recipe: Recipe, kind: str, folder: Path) -> tuple[VAE, dict]:
+    config = recipe.image_vae if kind == "image-vae" else recipe.raymap_vae
+    spread = folder / kind / "spread.json"
+    if not spread.exists():
+        raise ValueError(f"stage {kind!r} of preset {recipe.name!r} is not finished ({spread} is missing); train that stage first")
+    network = VAE(dataclasses.replace(config, scaling=json.loads(spread.read_text())["scaling"]))
+    return network, _load_average(network, folder / kind, recipe.name, kind)
+
+
+@torch.no_grad()
+def _record_spread(task: VAEStage, averaged: dict, folder: Path) -> None:
+    """Write the scaling that gives the trained latents unit variance, and how well the autoencoder reconstructs."""
+    task.network.load_state_dict(averaged)
+    task.network.eval()
+    values = torch.cat([task.batch(-1 - k) for k in range(16)])
+    mean, _ = task.network.posterior(values)
+    rows = {"scaling": 1.0 / float(mean.std()), "views": len(values), **reconstruction_error(task.network, values)}
+    (folder / "spread.json").write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = torch.float32) -> None:
+    """Write the averaged weights of all three stages as one model folder with the record of their training."""
+    dit = DiT(recipe.dit)
+    records = [_load_average(dit, folder / "dit", recipe.name, "dit")]
+    vaes = {}
+    for kind in STAGES[:2]:
+        vaes[kind], record = _trained_vae(recipe, kind, folder)
+        records.append(record | {"reconstruction": json.loads((folder / kind / "spread.json").read_text())})
+    info = {
+        "preset": recipe.name,
+        "seed": recipe.seed,
+        "image_size": recipe.pool.image_size,
+        "views": recipe.dit_loss.task.views,
+        "families": list(recipe.pool.families),
+        "training": records,
+    }
+    checkpoint.save(output, dit=dit, image_vae=vaes["image-vae"], raymap_vae=vaes["raymap-vae"], info=info, dtype=dtype)
+    _logger.info("wrote the model to %s", output)
+
+
+def _load_average(network: nn.Module, folder: Path, preset: str, stage: str) -> dict:
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        raise ValueError(f"stage {stage!r} of preset {preset!r} is not trained yet ({path} is missing); train that stage first")
+    state = torch.load(path, weights_only=True, map_location="cpu")
+    network.load_state_dict(state["average"])
+    return {"stage": stage, "steps": state["step"], "seconds": round(state["seconds"]), "losses": state["smoothed"]}

@@ -1,0 +1,29 @@
+"""Training presets. An ablation is ``dataclasses.replace(base, one_field=...)``."""
+
+from __future__ import annotations
+
+from fb_core.data.sequences import PoolConfig, TaskConfig
+from fb_core.networks.dit import DiTConfig
+from fb_core.networks.vae import VAEConfig
+from fb_core.training.dit_stage import DiTLossConfig
+from fb_core.training.loop import LoopConfig
+from fb_core.training.recipe import Recipe
+from fb_core.training.vae_stage import VAELossConfig
+
+ROOMS_TINY = Recipe(
+    name="rooms-tiny",
+    image_vae=VAEConfig(widths=(16, 32, 64, 64), encoder_resnets=1, decoder_resnets=1, norm_groups=8),
+    raymap_vae=VAEConfig(in_channels=6, widths=(8, 16, 32, 32), encoder_resnets=1, decoder_resnets=1, norm="none", padding="replicate"),
+    dit=DiTConfig(heads=4, head_dim=64, depth=6, text_width=0),
+    pool=PoolConfig(families=("narrow",), rooms=400, views=20, image_size=64, renewed_per_step=0.5),
+    image_vae_loop=LoopConfig(steps=2500, learning_rate=1.5e-3, cooldown=0.4),
+    raymap_vae_loop=LoopConfig(steps=2500, learning_rate=1.5e-3, cooldown=0.4),
+    dit_loop=LoopConfig(steps=3000, learning_rate=8e-4, warmup_steps=100),
+    image_vae_loss=VAELossConfig(batch=8),
+    raymap_vae_loss=VAELossConfig(batch=16),
+    # Heading and fill as at inference: a small model has none to spare for what the canonical frame can settle.
+    dit_loss=DiTLossConfig(batch=12, task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False), ray_weight=0.3),
+)
+"""The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about an hour and a half."""
+
+PRESETS: dict[str, Recipe] = {recipe.name: recipe for recipe in (ROOMS_TINY,)}
