@@ -1,0 +1,142 @@
+"""Generated views with their cameras and where they came from: what a checkpoint stores and training draws from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, UInt8
+from torch import Tensor
+
+from fb_core.data.captures import Capture, FrameToWrite, write_capture
+from fb_core.geometry.cameras import Pinholes
+
+ANCHOR, DENSIFY = "anchor", "densify"
+_STATE_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Where one generated view came from: enough to generate it again."""
+
+    role: str
+    """``anchor`` (conditioned on the capture) or ``densify`` (conditioned on the capture and the anchors)."""
+    round: int
+    """Pass of the diffusion model, counted from 0; the views of one pass were generated together."""
+    seed: int
+    """Seed of that pass."""
+    prompt: str
+    """Text the pass was conditioned on; empty without one."""
+    model_hash: str
+    """Content hash of the diffusion weights."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletedViews:
+    """``n`` generated views of one size, in the world of the splats."""
+
+    images: UInt8[Tensor, "n h w 3"]
+    """RGB, 8 bits."""
+    masks: Bool[Tensor, "n h w 1"]
+    """True where the pixel supervises the splats."""
+    cameras: Pinholes
+    """OpenCV axes; the images' size."""
+    origins: tuple[Origin, ...]
+    """One for each view."""
+
+    def __post_init__(self) -> None:
+        count, height, width, _ = self.images.shape
+        told = {"masks": tuple(self.masks.shape[:3]), "cameras": (len(self.cameras), self.cameras.height, self.cameras.width)}
+        told["origins"] = (len(self.origins), height, width)
+        for name, got in told.items():
+            if got != (count, height, width):
+                raise ValueError(f"CompletedViews: expected {name} for {(count, height, width)} like the images, got {got}")
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def __getitem__(self, index: Sequence[int]) -> CompletedViews:
+        """The chosen views."""
+        index = list(index)
+        return CompletedViews(
+            images=self.images[index],
+            masks=self.masks[index],
+            cameras=self.cameras[index],
+            origins=tuple(self.origins[i] for i in index),
+        )
+
+    @property
+    def rounds(self) -> list[int]:
+        """The passes that have views, ascending."""
+        return sorted({origin.round for origin in self.origins})
+
+    def of_round(self, number: int) -> CompletedViews:
+        """The views that were generated together in one pass."""
+        return self[[index for index, origin in enumerate(self.origins) if origin.round == number]]
+
+    @staticmethod
+    def cat(groups: Sequence[CompletedViews]) -> CompletedViews:
+        """All views. Raises ValueError when the sizes differ."""
+        return CompletedViews(
+            cameras=Pinholes.cat([group.cameras for group in groups]),
+            images=torch.cat([group.images for group in groups]),
+            masks=torch.cat([group.masks for group in groups]),
+            origins=tuple(origin for group in groups for origin in group.origins),
+        )
+
+    def state(self) -> dict[str, Any]:
+        """The views as tensors, numbers and strings alone, so that a checkpoint loads with ``weights_only=True``."""
+        return {
+            "version": _STATE_VERSION,
+            "images": self.images.cpu(),
+            "masks": self.masks.cpu(),
+            "camera_to_world": self.cameras.camera_to_world.cpu(),
+            "focal": self.cameras.focal.cpu(),
+            "principal": self.cameras.principal.cpu(),
+            "width": self.cameras.width,
+            "height": self.cameras.height,
+            "origins": [dataclasses.asdict(origin) for origin in self.origins],
+        }
+
+    @staticmethod
+    def from_state(state: dict[str, Any]) -> CompletedViews:
+        """The exact inverse of :meth:`state`. Raises ValueError for a state of a newer version."""
+        if state["version"] != _STATE_VERSION:
+            raise ValueError(
+                f"completed views: this version reads state version {_STATE_VERSION}, got {state['version']}; update fillerbuster"
+            )
+        cameras = Pinholes(
+            camera_to_world=state["camera_to_world"],
+            focal=state["focal"],
+            principal=state["principal"],
+            width=state["width"],
+            height=state["height"],
+        )
+        origins = tuple(Origin(**origin) for origin in state["origins"])
+        return CompletedViews(images=state["images"], masks=state["masks"], cameras=cameras, origins=origins)
+
+    def save_capture(self, folder: Path) -> Capture:
+        """Write the views as a capture folder (transforms.json, images, masks where they are not whole), replacing an earlier one.
+
+        Poses are in the world of the splats, so ``orientation_override`` keeps nerfstudio's reader from turning them. Each
+        frame says that it was generated, and how. The folder appears whole or not at all.
+        """
+        images = self.images.cpu().permute(0, 3, 1, 2).float() / 255
+        masks = self.masks.cpu().permute(0, 3, 1, 2).float()
+        cameras = self.cameras.to("cpu", torch.float64)
+        whole = bool(self.masks.all())
+        frames = [
+            FrameToWrite(
+                name=f"{origin.role}_{origin.round:02d}_{index:04d}",
+                image=images[index],
+                mask=None if whole else masks[index],
+                camera=cameras[index],
+                extra={"generated": True, **dataclasses.asdict(origin)},
+            )
+            for index, origin in enumerate(self.origins)
+        ]
+        return write_capture(folder, frames, extra={"orientation_override": "none"}, overwrite=True)
