@@ -78,6 +78,9 @@ class Shapes:
 class Footprint:
     """One camera's view of n Gaussians, in columns; the names are those of the formulas above."""
 
+    u: Tensor
+    """Centre, pixels."""
+    v: Tensor
     x: Tensor
     y: Tensor
     z: Tensor
@@ -146,7 +149,11 @@ def _cross(p: Float[Tensor, "3 n"], q: Float[Tensor, "3 n"]) -> Float[Tensor, "3
 def footprint(means: Float[Tensor, "n 3"], shapes: Shapes, viewmat: Float[Tensor, "4 4"], lens: Lens, blur: float) -> Footprint:
     """Project; what lies in or behind the image plane comes out as garbage, which the caller culls."""
     rotation = viewmat[:3, :3]
-    x, y, z = torch.addmm(viewmat[:3, 3:], rotation, means.t()).unbind(0)
+    # Centres in double: their rounding is what float32 pictures lose first (1e-5 pixel, times the slope of a footprint).
+    exact = torch.addmm(viewmat[:3, 3:].double(), rotation.double(), means.t().double())
+    u = exact[0].div(exact[2]).mul_(lens.fx).add_(lens.cx).to(means.dtype)
+    v = exact[1].div(exact[2]).mul_(lens.fy).add_(lens.cy).to(means.dtype)
+    x, y, z = exact.to(means.dtype).unbind(0)
     over_z = z.reciprocal()
     jx, jy = over_z * lens.fx, over_z * lens.fy
     jxz = (x * over_z).clamp_(lens.left, lens.right).mul_(jx).neg_()
@@ -168,6 +175,8 @@ def footprint(means: Float[Tensor, "n 3"], shapes: Shapes, viewmat: Float[Tensor
     c.add_(blur)
     jacobian = (jx, jxz, jy, jyz)
     return Footprint(
+        u=u,
+        v=v,
         x=x,
         y=y,
         z=z,

@@ -118,9 +118,9 @@ def _radii(view: Footprint, opacity: Tensor, semantics: Semantics) -> tuple[Tens
     return (extent * view.a.sqrt()).ceil_(), (extent * view.c.sqrt()).ceil_()
 
 
-def _hidden(view: Footprint, u: Tensor, v: Tensor, radii: tuple[Tensor, Tensor], opacity: Tensor, settings: ProjectionSettings) -> Tensor:
+def _hidden(view: Footprint, radii: tuple[Tensor, Tensor], opacity: Tensor, settings: ProjectionSettings) -> Tensor:
     """Which rows are culled: by depth, a degenerate covariance, the radius clip, or for lying beside the image."""
-    rx, ry = radii
+    (rx, ry), u, v = radii, view.u, view.v
     drawn = (view.z >= settings.near_plane) & (view.z <= settings.far_plane)
     drawn &= (view.determinant > 0) & (view.determinant < math.inf)
     drawn &= torch.maximum(rx, ry) > settings.radius_clip
@@ -143,16 +143,15 @@ class _Project(torch.autograd.Function):
             radii = torch.zeros((cameras, n) if square else (cameras, n, 2), dtype=torch.int32, device=means.device)
             for camera, lens in enumerate(lenses):
                 view = footprint(means, shapes, viewmats[camera], lens, settings.eps2d)
-                u, v = (view.x * lens.fx / view.z).add_(lens.cx), (view.y * lens.fy / view.z).add_(lens.cy)
                 factor = compensation(view, floor)
                 opacity = opacities * factor if settings.antialiased else opacities
                 boxes = _radii(view, opacity, settings.semantics)
-                hidden = _hidden(view, u, v, boxes, opacity, settings)
+                hidden = _hidden(view, boxes, opacity, settings)
                 if usable is not None:
                     hidden |= ~usable
                 over = view.determinant.reciprocal()
                 rows = hidden[:, None]
-                means2d[camera] = torch.stack([u, v], dim=1).masked_fill_(rows, 0.0)
+                means2d[camera] = torch.stack([view.u, view.v], dim=1).masked_fill_(rows, 0.0)
                 conics[camera] = torch.stack([view.c * over, -view.b * over, view.a * over], dim=1).masked_fill_(rows, 0.0)
                 depths[camera] = view.z.masked_fill(hidden, 0.0)
                 compensations[camera] = factor.masked_fill_(hidden, 0.0)
