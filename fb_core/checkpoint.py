@@ -179,7 +179,7 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
             raise ValueError(f"{path}: expected section {name!r} to be an object, got {content[name]!r}.")
         require_names(f"{path}, section {name!r}", (f.name for f in dataclasses.fields(kind)), content[name])
         try:
-            sections[name] = kind(**content[name])
+            sections[name] = kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()})
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, section {name!r}: {error}") from error
     try:
