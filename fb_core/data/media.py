@@ -59,7 +59,7 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
     """(height, width) in pixels, upright, from the file's header and its end (a file cut short is refused); nothing is decoded."""
     path = _checked_file(path)
     if path.suffix.lower() in _HEIF_SUFFIXES:
-        width, height = _pillow_heif(path).open_heif(path).size
+        width, height = _opened_heif(path).size
         return height, width
     reader = _opened(path)
     spec = reader.spec()
@@ -218,23 +218,27 @@ def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
 
 def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     """Like :func:`_decode` for HEIC photos; their decoder turns them upright itself."""
+    image = _opened_heif(path)
     try:
-        image = _pillow_heif(path).open_heif(path)
-        array = np.asarray(image)
-    except (OSError, RuntimeError, SyntaxError) as error:
-        raise ValueError(f"image {path}: not readable as HEIC ({_one_line(str(error))}); convert it to JPEG") from error
-    pixels = rearrange(torch.from_numpy(np.array(array)), "h w c -> c h w")
+        array = np.array(image)
+    except (OSError, RuntimeError, SyntaxError, ValueError) as error:
+        raise ValueError(f"image {path}: damaged or truncated HEIC ({_one_line(str(error))}); copy it again from its source") from error
+    pixels = rearrange(torch.from_numpy(array), "h w c -> c h w")
     return pixels.float() / 255, list(image.mode), 1
 
 
-def _pillow_heif(path: Path):
+def _opened_heif(path: Path):
+    """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency."""
     try:
         import pillow_heif
     except ImportError as error:
         raise ValueError(
             f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install 'fillerbuster[heic]' or convert to JPEG"
         ) from error
-    return pillow_heif
+    try:
+        return pillow_heif.open_heif(path)
+    except (OSError, RuntimeError, SyntaxError, ValueError) as error:
+        raise ValueError(f"image {path}: not readable as HEIC ({_one_line(str(error))}); copy it again or convert it to JPEG") from error
 
 
 def _upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, "c h2 w2"]:
@@ -255,6 +259,7 @@ def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: 
     height, width, count = array.shape
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
+        oiio.geterror()  # taken off its list, or it is printed at exit
         raise ValueError(f"cannot write {path}: no image format has the suffix {path.suffix!r}; use .png, .jpg or .exr")
     kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
     spec = oiio.ImageSpec(width, height, count, kinds[array.dtype.name])
