@@ -44,8 +44,8 @@ class LayerNorm(nn.Module):
         return F.layer_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), self.bias.to(dtype), EPS)
 
 
-def modulated(x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
-    """x * (1 + scale) + shift, the same for all tokens of a sample."""
+def modulated(x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"]) -> Float[Tensor, "b tokens d"]:
+    """x * (1 + scale) + shift, the same for all tokens of a sample (or of all samples)."""
     scale, shift = scale_shift[0, :, None], scale_shift[1, :, None]
     return torch.addcmul(x + shift, x, scale)
 
@@ -63,7 +63,7 @@ class AdaptiveNorm(nn.Module):
         raw = self.linear(activated.to(self.linear.weight.dtype))
         return rearrange(raw.to(at_least_float32(raw.dtype)), "b (two d) -> two b d", two=2)
 
-    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 b d"]) -> Float[Tensor, "b tokens d"]:
+    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"]) -> Float[Tensor, "b tokens d"]:
         """Normalised and modulated tokens, in the precision of the parameters."""
         return modulated(self.norm(x), scale_shift).to(self.linear.weight.dtype)
 
@@ -150,7 +150,7 @@ class Block(nn.Module):
         return [self.norm1, self.norm2, self.norm3] if self.reads_text else [self.norm1, self.norm3]
 
     def forward(
-        self, x: Float[Tensor, "b tokens d"], scale_shifts: Float[Tensor, "norms 2 b d"], text: KeysValues | None
+        self, x: Float[Tensor, "b tokens d"], scale_shifts: Float[Tensor, "norms 2 #b d"], text: KeysValues | None
     ) -> Float[Tensor, "b tokens d"]:
         """The residual stream after this block, given its norms' modulation and the text's keys and values (None without text)."""
         x = x + self.attn1(self.norm1(x, scale_shifts[0]))
