@@ -1,0 +1,164 @@
+"""The ``fillerbuster`` command: rooms, train, convert, demo, check.
+
+Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
+"""Environment variable that, set to anything, shows the traceback of an error."""
+_ENDED_BY_USER = 130  # what shells report for a command ended by Ctrl-C
+
+
+def rooms(
+    *,
+    output: Path,
+    seed: int = 0,
+    family: Literal["narrow", "medium", "wide"] = "narrow",
+    views: int = 24,
+    size: int = 128,
+    held_out: int = 16,
+    ground_truth: bool = False,
+) -> None:
+    """Make the casual capture of one procedural room, as a folder for ns-train.
+
+    Args:
+        output: New folder for the capture.
+        seed: Which room (0 or more); the same seed gives the same files.
+        family: How varied room and cameras are; the bundled model knows narrow rooms.
+        views: Captured pictures.
+        size: Width and height of the pictures in pixels.
+        held_out: Further ground-truth pictures, half of them covered by the capture and half not.
+        ground_truth: Also write depth and normals as EXR files.
+    """
+    from fb_core.data import room_captures
+
+    room_captures.rooms(seed, output, family=family, views=views, size=size, held_out=held_out, ground_truth=ground_truth)
+
+
+def train(
+    preset: Annotated[str, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    stage: Literal["all", "image-vae", "raymap-vae", "dit"] = "all",
+    steps: int | None = None,
+    minutes: float | None = None,
+    device: str | None = None,
+    half: bool = True,
+) -> None:
+    """Train a model from scratch; the same command again goes on where the last one ended.
+
+    Args:
+        preset: What to train, e.g. rooms-tiny (the bundled model).
+        output: Folder of the training; the finished model is its subfolder "model".
+        stage: One stage, or all three in turn.
+        steps: Steps per stage instead of the preset's.
+        minutes: Stop after so many minutes; a transformer that is not done by then is exported as it is.
+        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
+        half: Store the model in half precision (the raymap autoencoder never is).
+    """
+    from method_configs.training_command import train_preset
+
+    train_preset(preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half)
+
+
+def convert(
+    checkpoints: Annotated[Path, tyro.conf.Positional], /, *, output: Path, text_encoder: Path | None = None, half: bool = False
+) -> None:
+    """Turn the authors' released checkpoints into a model folder.
+
+    Args:
+        checkpoints: Folder with transformer.ckpt, image-vae.ckpt and pose-vae.ckpt.
+        output: New folder for the model.
+        text_encoder: Folder with the CLIP text model; stores the embedding of the empty prompt, so that CLIP is needed no more.
+        half: Store in half precision (the raymap autoencoder never is).
+    """
+    import torch
+
+    from fb_core import checkpoint
+
+    folder = checkpoint.convert(checkpoints, output, dtype=torch.float16 if half else None, text_encoder=text_encoder)
+    logging.getLogger(__name__).info("wrote the model to %s", folder)
+
+
+def demo(
+    *,
+    output: Path = Path("outputs/demo"),
+    seed: int = 0,
+    iterations: int = 600,
+    model: Path | None = None,
+) -> None:
+    """Complete a small room from end to end and compare with plain splatting, on this machine.
+
+    Args:
+        output: Folder for the capture, both runs, report.png and metrics.json; an earlier demo there is replaced.
+        seed: Which room.
+        iterations: Training steps of each run.
+        model: Model folder; by default the bundled one.
+    """
+    from method_configs.demo import run_demo
+
+    run_demo(output, seed=seed, iterations=iterations, model=model)
+
+
+def check(*, mend: bool = False) -> None:
+    """Say what this machine lacks, in one sentence each.
+
+    Args:
+        mend: Install OpenCV's contrib build again if another build has replaced it.
+    """
+    from method_configs import environment
+
+    environment.check(mend=mend)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"rooms": rooms, "train": train, "convert": convert, "demo": demo, "check": check}
+"""Every subcommand by its name."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The console script. An error that a user can mend is one sentence on stderr and a non-zero exit code."""
+    _show_log()
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="fillerbuster",
+            description=f"Complete casual captures. Set {DEBUG_VARIABLE}=1 for tracebacks.",
+            args=None if arguments is None else list(arguments),
+        )
+    except KeyboardInterrupt as error:
+        _stop(error, "Stopped.", _ENDED_BY_USER)
+    except (ValueError, FloatingPointError, OSError) as error:
+        _stop(error, f"Error: {error}", 1)
+
+
+def _stop(error: BaseException, sentence: str, code: int) -> None:
+    if os.environ.get(DEBUG_VARIABLE):
+        raise error
+    sys.stderr.write(" ".join(sentence.split()) + "\n")
+    sys.exit(code)
+
+
+def _show_log() -> None:
+    """Our own messages from INFO upwards, other packages' from WARNING upwards, on stderr in rich's manner."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, show_level=False, markup=False)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    for package in ("fb_core", "fb_nerfstudio", "method_configs"):
+        logging.getLogger(package).setLevel(logging.INFO)
+
+
+if __name__ == "__main__":
+    main()
