@@ -91,6 +91,7 @@ def run_stage(
     run = Run(task, loop if steps is None else dataclasses.replace(loop, steps=steps), folder / stage)
     run.train(on_progress=on_progress, minutes=minutes)
     if isinstance(task, VAEStage):
+        pool.advance(max(0, run.step - 1))  # the pool of a run that was finished already is still empty
         _record_spread(task, run.averaged_state(), folder / stage)
     return run
 
