@@ -17,8 +17,10 @@ positive, so gsplat's test for sigma < 0 only ever rejects rounding noise and is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +38,9 @@ PAIRS_PER_BLOCK = 2**17
 ROWS_PER_LIST = 2**20
 _NEVER = -1e4
 _TERMS = 6
+# Shape of a block, found by measuring: 16 ranks x 128 cells x 64 pixels. Deeper where there are fewer cells.
+_SHALLOWEST, _DEEPEST, _DEEPEST_THIN = 16, 64, 1024
+_THIN = 128
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +55,9 @@ class CompositingSettings:
     """Pairs (Gaussian, pixel) worked on at once: bounds the scratch memory and should fit the cache."""
     rows_per_list: int = ROWS_PER_LIST
     """Pairs (Gaussian, cell) listed at once: bounds the memory of the lists."""
+
+    def cells_per_block(self, pixels: int) -> int:
+        return max(1, self.pairs_per_block // (_SHALLOWEST * pixels))
 
 
 def composite(
@@ -75,31 +83,31 @@ class _Table:
     """Columns of the chosen Gaussians, and the constants of the grid."""
 
     ellipses: Ellipses
-    log_opacity: Tensor
+    log_opacity: Float[Tensor, " v"]
     values: Float[Tensor, "v d1"]
     """With a last channel of ones, which composites to alpha."""
     monomials: Float[Tensor, "6 p"]
-    center_x: Tensor
-    center_y: Tensor
-    threshold: float
+    center_x: Float[Tensor, " cells"]
+    center_y: Float[Tensor, " cells"]
+    alpha_threshold: float
     """The largest number below 1/255."""
-    cap: float | None
-    """None where no opacity exceeds it."""
+    cap: float
+    log_cap: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Block:
-    """B ranks deep, S cells wide, P pixels each; index order (b, s)."""
+    """B ranks deep, S cells wide, P pixels each; where two of them are one index the order is (b, s)."""
 
-    depth: int
-    cells: Tensor
+    width: int
+    """S: the block covers the first S cells of its stretch."""
     splats: Int32[Tensor, " bs"]
     """Rows of the table; padding points at some row and has alpha 0."""
-    dx: Tensor
-    dy: Tensor
+    dx: Float[Tensor, " bs"]
+    dy: Float[Tensor, " bs"]
     """Mean less cell centre."""
     alpha: Float[Tensor, "b s p"]
-    before: Float[Tensor, "b s p"]
+    light: Float[Tensor, "b s p"]
     """Transmittance in front of each."""
     capped: Tensor | None
     """Pairs at the cap (bool), or None where there are none."""
@@ -113,9 +121,7 @@ class _Scratch:
         self._buffers: dict[str, Tensor] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
-        size = 1
-        for length in shape:
-            size *= length
+        size = math.prod(shape)
         buffer = self._buffers.get(name)
         if buffer is None or buffer.numel() < size:
             buffer = self._buffers[name] = self._like.new_empty(size)
@@ -132,8 +138,6 @@ def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
 def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _Table:
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
     center_x, center_y = grid.centers(values)
-    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
-    may_cap = ellipses.opacity.numel() > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
     return _Table(
         ellipses=ellipses,
         log_opacity=ellipses.opacity.log(),
@@ -141,23 +145,76 @@ def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _T
         monomials=_monomials(grid.size, values),
         center_x=center_x,
         center_y=center_y,
-        threshold=float(below),
-        cap=cap if may_cap else None,
+        alpha_threshold=float(below),
+        cap=cap,
+        # A little slack: the polynomial may round an exponent to slightly above log(opacity).
+        log_cap=math.log(cap) - 1e-3,
     )
 
 
-def _coefficients(table: _Table, splats: Tensor, cells: Tensor, padding: Tensor, scratch: _Scratch) -> tuple[Tensor, Tensor, Tensor]:
+class _Stretch:
+    """Cells of similar length that are walked together, front to back, until most are opaque or all are done."""
+
+    def __init__(self, cells: Tensor, counts: Tensor, starts: Tensor, rank: int):
+        self.cells, self.rest = cells, None
+        """`rest`: after `blocks`, the stretch of the cells that still need work, or None."""
+        self._counts, self._starts, self._rank = counts, starts, rank
+
+    def blocks(self, table: _Table, listed: Tensor, transmittance: Tensor, scratch: _Scratch, budget: int) -> Iterator[_Block]:
+        """The blocks in order; at the end the cells' transmittance [cells, p] is up to date."""
+        pixels, rank, deepest = table.monomials.shape[1], self._rank, int(self._counts[0])
+        light = transmittance.index_select(0, self.cells)
+        while rank < deepest:
+            width = int((self._counts > rank).sum())  # the counts descend: finished cells are at the end
+            most = _DEEPEST if width * pixels >= _THIN else _DEEPEST_THIN
+            depth = min(max(_SHALLOWEST, budget // (width * pixels)), most, deepest - rank)
+            block = self._block(table, listed, light[:width], rank, depth, scratch)
+            after = scratch.take("light", depth + 1, width, pixels)[depth]
+            light[:width] = after
+            opaque = float(after.min()) <= TRANSMITTANCE_MIN
+            if opaque:
+                _stop(block.alpha, scratch.take("light", depth + 1, width, pixels)[1:])
+            rank += depth
+            yield block
+            if opaque and rank < deepest:
+                open_cells = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
+                if int(open_cells.sum()) <= 0.75 * width:
+                    kept = open_cells.nonzero()[:, 0]
+                    if kept.numel():
+                        self.rest = _Stretch(*(column.index_select(0, kept) for column in (self.cells, self._counts, self._starts)), rank)
+                    break
+        transmittance.index_copy_(0, self.cells, light)
+
+    def _block(self, table: _Table, listed: Tensor, light: Tensor, rank: int, depth: int, scratch: _Scratch) -> _Block:
+        width, pixels = light.shape
+        ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=light.device)[:, None]
+        padding = ranks >= self._counts[:width]
+        splats = listed.index_select(0, (ranks + self._starts[:width]).masked_fill_(padding, 0).view(-1))
+        log_opacity = table.log_opacity.index_select(0, splats)
+        may_cap = float(log_opacity.max()) > table.log_cap
+        k, dx, dy = _coefficients(table, splats, log_opacity, self.cells[:width], padding, scratch)
+        alpha = torch.mm(k.t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
+        alpha = F.threshold_(alpha.exp_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
+        capped = None
+        if may_cap:
+            capped = alpha > table.cap
+            alpha.clamp_(max=table.cap)
+        lights = scratch.take("light", depth + 1, width, pixels)
+        lights[0] = light
+        _darken(alpha, lights)
+        return _Block(width=width, splats=splats, dx=dx, dy=dy, alpha=alpha, light=lights[:depth], capped=capped)
+
+
+def _coefficients(table: _Table, splats: Tensor, log_opacity: Tensor, cells: Tensor, padding: Tensor, scratch: _Scratch):
     """The polynomials [6, b s] of the listed Gaussians around their cells' centres, and mean less centre."""
-    ellipses = table.ellipses
-    shape = padding.shape
+    ellipses, shape = table.ellipses, padding.shape
     k = scratch.take("coefficients", _TERMS, splats.numel())
     A, B, C = (column.index_select(0, splats) for column in (ellipses.A, ellipses.B, ellipses.C))
     dx = ellipses.x.index_select(0, splats).view(shape).sub_(table.center_x.index_select(0, cells)).view(-1)
     dy = ellipses.y.index_select(0, splats).view(shape).sub_(table.center_y.index_select(0, cells)).view(-1)
     torch.mul(A, dx, out=k[1]).addcmul_(B, dy)
     torch.mul(B, dx, out=k[2]).addcmul_(C, dy)
-    torch.index_select(table.log_opacity, 0, splats, out=k[0])
-    k[0].addcmul_(dx, k[1], value=-0.5).addcmul_(dy, k[2], value=-0.5)
+    torch.addcmul(log_opacity, dx, k[1], value=-0.5, out=k[0]).addcmul_(dy, k[2], value=-0.5)
     k[0].masked_fill_(padding.view(-1), _NEVER)
     torch.mul(A, -0.5, out=k[3])
     torch.neg(B, out=k[4])
@@ -165,121 +222,99 @@ def _coefficients(table: _Table, splats: Tensor, cells: Tensor, padding: Tensor,
     return k, dx, dy
 
 
-def _march(table: _Table, lists: CellLists, transmittance: Tensor, scratch: _Scratch, budget: int) -> Iterator[_Block]:
-    """All blocks, front to back in every cell; `transmittance` [cells, p] is advanced in place."""
-    pixels = table.monomials.shape[1]
-    busy = torch.argsort(lists.counts, descending=True, stable=True)
-    busy = busy[: int((lists.counts > 0).sum())]
-    for cells in busy.split(max(1, budget // (8 * pixels))):
-        counts, starts, rank = lists.counts.index_select(0, cells), lists.starts.index_select(0, cells), 0
-        while cells.numel():
-            width = cells.numel()
-            most = 64 if width * pixels >= 1024 else 1024
-            depth = min(max(8, budget // (width * pixels)), most, int(counts[0]) - rank)
-            ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=cells.device)[:, None]
-            padding = ranks >= counts
-            listed = (starts + ranks).masked_fill_(padding, 0).view(-1)
-            splats = lists.splats.index_select(0, listed)
-            k, dx, dy = _coefficients(table, splats, cells, padding, scratch)
-            alpha = scratch.take("alpha", depth * width, pixels)
-            torch.mm(k.t(), table.monomials, out=alpha)
-            F.threshold_(alpha.exp_(), table.threshold, 0.0)
-            alpha, capped = alpha.view(depth, width, pixels), None
-            if table.cap is not None:
-                capped = alpha > table.cap
-                capped = capped if bool(capped.any()) else None
-                alpha.clamp_(max=table.cap)
-            light = scratch.take("light", depth + 1, width, pixels)
-            torch.index_select(transmittance, 0, cells, out=light[0])
-            _multiply_through(alpha, light)
-            after = light[depth]
-            if float(after.min()) <= TRANSMITTANCE_MIN:
-                drawn = torch.threshold(light[1:], TRANSMITTANCE_MIN, 0.0).mul_(1e30).clamp_(max=1.0)
-                alpha.mul_(drawn)
-            transmittance.index_copy_(0, cells, after)
-            rank += depth
-            kept = (counts > rank) & (after.amax(dim=1) > TRANSMITTANCE_MIN)
-            yield _Block(depth=depth, cells=cells, splats=splats, dx=dx, dy=dy, alpha=alpha, before=light[:depth], capped=capped)
-            if not bool(kept.all()):
-                remaining = kept.nonzero()[:, 0]
-                cells, counts, starts = (column.index_select(0, remaining) for column in (cells, counts, starts))
-
-
-def _multiply_through(alpha: Tensor, light: Tensor) -> None:
-    """light[b + 1] = light[b] (1 - alpha[b]), in place."""
-    depth = alpha.shape[0]
-    passed = torch.sub(1.0, alpha, out=light[1:])
-    if light[0].numel() < 1024:  # thin blocks: one scan beats many tiny calls
-        torch.cumprod(light, dim=0, out=light)
+def _darken(alpha: Tensor, lights: Tensor) -> None:
+    """lights[b + 1] = lights[b] (1 - alpha[b]), in place."""
+    torch.sub(1.0, alpha, out=lights[1:])
+    if alpha[0].numel() < _THIN:  # one slow scan beats very many tiny calls
+        torch.cumprod(lights, dim=0, out=lights)
         return
-    for b in range(depth):
-        passed[b].mul_(light[b])
+    layers = lights.unbind(0)
+    for before, after in pairwise(layers):
+        after.mul_(before)
+
+
+def _stop(alpha: Tensor, after: Tensor) -> None:
+    """Take out the Gaussian that would end a pixel, and all behind it. In floats: comparisons cost five times as much."""
+    alpha.mul_(torch.threshold(after, TRANSMITTANCE_MIN, 0.0).mul_(1e30).clamp_(max=1.0))
+
+
+def _march(lists: CellLists, width: int) -> Iterator[_Stretch]:
+    """All cells that have something to draw, in stretches of at most `width` cells, long lists first."""
+    busy = torch.argsort(lists.counts, descending=True)[: int((lists.counts > 0).sum())]
+    for cells in busy.split(width):
+        stretch = _Stretch(cells, lists.counts.index_select(0, cells), lists.starts.index_select(0, cells), 0)
+        while stretch is not None:
+            yield stretch
+            stretch = stretch.rest
 
 
 def _forward_block(block: _Block, table: _Table, image: Tensor, scratch: _Scratch) -> None:
-    depth, width, pixels = block.alpha.shape
-    weights = torch.mul(block.alpha, block.before, out=scratch.take("weights", depth, width, pixels))
-    values = table.values.index_select(0, block.splats).view(depth, width, -1)
-    image.index_add_(0, block.cells, torch.bmm(values.permute(1, 2, 0), weights.permute(1, 0, 2)))
+    """Add the block to the cells [s, d1, p] of its stretch."""
+    weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", *block.alpha.shape))
+    values = table.values.index_select(0, block.splats).view(-1, block.width, table.values.shape[1])
+    image[: block.width].baddbmm_(values.permute(1, 2, 0), weights.permute(1, 0, 2))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Sums:
-    """Gradients collected by Gaussian of the table."""
+    """Gradients collected by row of the table."""
 
-    moments: Float[Tensor, "6 v"]
+    moments: Float[Tensor, "v 6"]
     """Sums of g times 1, dx, dy, dx^2, dx dy, dy^2, with d = mean - pixel."""
     values: Float[Tensor, "v d1"]
-    absolute: Float[Tensor, "2 v"] | None
+    absolute: Float[Tensor, "v 2"] | None
     """Sums of |d loss / d mean2d| by pixel."""
 
 
 def _backward_block(block: _Block, table: _Table, upstream: Tensor, behind: Tensor, sums: _Sums, scratch: _Scratch) -> None:
-    """Add the block's gradients; `behind` [cells, p], the part of the loss that lies behind, is advanced in place."""
+    """Add the block's gradients; `behind` [s, p], the part of the loss that lies behind, is advanced in place."""
     depth, width, pixels = block.alpha.shape
-    arriving = upstream.index_select(0, block.cells)
-    weights = torch.mul(block.alpha, block.before, out=scratch.take("weights", depth, width, pixels))
-    by_cell = block.splats.view(depth, width).t().reshape(-1)
-    v_values = torch.bmm(weights.permute(1, 0, 2), arriving.transpose(1, 2))
-    sums.values.index_add_(0, by_cell, v_values.view(depth * width, -1))
+    upstream, behind = upstream[:width], behind[:width]
+    # index_add_ is several times faster with 64-bit indices
+    splats = block.splats.long()
+    by_cell = splats.view(depth, width).t().reshape(-1)
+    weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", depth, width, pixels))
+    v_values = torch.bmm(upstream, weights.permute(1, 2, 0))
+    sums.values.index_add_(0, by_cell, v_values.transpose(1, 2).reshape(depth * width, -1))
     values = table.values.index_select(0, by_cell).view(width, depth, -1)
-    seen = torch.bmm(values, arriving, out=scratch.take("seen", width, depth, pixels))
+    seen = torch.bmm(values, upstream, out=scratch.take("seen", width, depth, pixels))
     share = weights.mul_(seen.permute(1, 0, 2))
     rest = scratch.take("rest", depth, width, pixels)
-    front = behind.index_select(0, block.cells)
-    for b in range(depth):
-        front = torch.sub(front, share[b], out=rest[b])
-    behind.index_copy_(0, block.cells, front)
+    front = behind
+    for part, remaining in zip(share.unbind(0), rest.unbind(0), strict=True):
+        front = torch.sub(front, part, out=remaining)
+    behind.copy_(front)
     # d loss / d exponent = alpha T (value . upstream) - alpha / (1 - alpha) * what lies behind
     ratio = torch.sub(1.0, block.alpha, out=scratch.take("seen", depth, width, pixels))
     g = share.addcmul_(torch.div(block.alpha, ratio, out=ratio), rest, value=-1.0)
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
-    _add_moments(block, torch.mm(table.monomials, g.t()), sums.moments)
+    sums.moments.index_add_(0, splats, _central_moments(block, torch.mm(table.monomials, g.t())))
     if sums.absolute is not None:
-        _add_absolute(block, table, g, sums.absolute, scratch)
+        sums.absolute.index_add_(0, splats, _absolute_pulls(block, table, g, scratch))
 
 
-def _add_moments(block: _Block, local: Tensor, moments: Tensor) -> None:
-    """Shift the moments about the cell centre, sums of g times monomials of (u, v), to d = (dx - u, dy - v), and add them."""
+def _central_moments(block: _Block, local: Float[Tensor, "6 bs"]) -> Float[Tensor, "bs 6"]:
+    """Shift sums of g times monomials of (u, v) about the cell centre to d = (dx - u, dy - v) about the mean."""
     m, mu, mv, muu, muv, mvv = local.unbind(0)
     dx, dy = block.dx, block.dy
     mx, my = dx * m - mu, dy * m - mv
-    mxx = (dx * (mx - mu)).add_(muu)
+    mxx = (mx - mu).mul_(dx).add_(muu)
     mxy = (dx * my).addcmul_(dy, mu, value=-1.0).add_(muv)
-    myy = (dy * (my - mv)).add_(mvv)
-    moments.index_add_(1, block.splats, torch.stack([m, mx, my, mxx, mxy, myy]))
+    myy = (my - mv).mul_(dy).add_(mvv)
+    return torch.stack([m, mx, my, mxx, mxy, myy], dim=1)
 
 
-def _add_absolute(block: _Block, table: _Table, g: Tensor, absolute: Tensor, scratch: _Scratch) -> None:
-    """|d loss / d mean2d| of a pixel is |g| |conic d|, and conic d is linear in (u, v)."""
+def _absolute_pulls(block: _Block, table: _Table, g: Tensor, scratch: _Scratch) -> Float[Tensor, "bs 2"]:
+    """Sums over pixels of |g| |conic d|, the gradient of the mean before its signs cancel; conic d is linear in (u, v). Uses g up."""
     A, B, C = (column.index_select(0, block.splats) for column in (table.ellipses.A, table.ellipses.B, table.ellipses.C))
-    size = g.abs_()
-    for axis, (p, q) in enumerate(((A, B), (B, C))):
+    size, sums = g.abs_(), []
+    for p, q in ((A, B), (B, C)):
         line = torch.stack([(p * block.dx).addcmul_(q, block.dy), -p, -q])
         pull = torch.mm(line.t(), table.monomials[:3], out=scratch.take("rest", *g.shape))
-        absolute[axis].index_add_(0, block.splats, pull.abs_().mul_(size).sum(dim=1))
+        sums.append(pull.abs_().mul_(size).sum(dim=1))
+    return torch.stack(sums, dim=1)
 
 
 def _lists(ellipses: Ellipses, strips: Strips, grid: CellGrid, budget: int, transmittance: Tensor) -> Iterator[CellLists]:
@@ -311,8 +346,11 @@ class _Composite(torch.autograd.Function):
             image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
             transmittance = values.new_ones(grid.count, pixels)
             for lists in _lists(ellipses, strips, grid, settings.rows_per_list, transmittance):
-                for block in _march(table, lists, transmittance, scratch, settings.pairs_per_block):
-                    _forward_block(block, table, image, scratch)
+                for stretch in _march(lists, settings.cells_per_block(pixels)):
+                    local = image.new_zeros(stretch.cells.shape[0], *image.shape[1:])
+                    for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
+                        _forward_block(block, table, local, scratch)
+                    image.index_add_(0, stretch.cells, local)
             out = _to_image(image, grid)
             colors, alphas = out[..., :-1].contiguous(), out[..., -1:].contiguous()
         ctx.save_for_backward(means2d, conics, opacities, values, chosen, image)
@@ -331,14 +369,17 @@ class _Composite(torch.autograd.Function):
             transmittance = torch.ones_like(behind)
             number = values.shape[0]
             sums = _Sums(
-                moments=values.new_zeros(_TERMS, number),
+                moments=values.new_zeros(number, _TERMS),
                 values=torch.zeros_like(table.values),
-                absolute=values.new_zeros(2, number) if settings.absgrad else None,
+                absolute=values.new_zeros(number, 2) if settings.absgrad else None,
             )
             for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
-                for block in _march(table, lists, transmittance, scratch, settings.pairs_per_block):
-                    _backward_block(block, table, upstream, behind, sums, scratch)
-            m, mx, my, mxx, mxy, myy = sums.moments.unbind(0)
+                for stretch in _march(lists, settings.cells_per_block(behind.shape[1])):
+                    arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
+                    for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
+                        _backward_block(block, table, arriving, hidden, sums, scratch)
+                    behind.index_copy_(0, stretch.cells, hidden)
+            m, mx, my, mxx, mxy, myy = sums.moments.t().contiguous().unbind(0)
             A, B, C = ellipses.A, ellipses.B, ellipses.C
 
             def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
@@ -346,7 +387,7 @@ class _Composite(torch.autograd.Function):
                 return flat.index_copy_(0, chosen.long(), torch.stack(columns, dim=1)).view(like.shape)
 
             if sums.absolute is not None:
-                means2d.absgrad = dense(means2d, list(sums.absolute.unbind(0)))
+                means2d.absgrad = dense(means2d, list(sums.absolute.unbind(1)))
             v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
             v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
             v_opacities = dense(opacities, [m / ellipses.opacity])
