@@ -44,6 +44,14 @@ def _shared_path_fixture():
     return shared_path
 
 
+@pytest.fixture
+def shapes_unchecked():
+    """Turns the shape checks off, to reach the sentences that a user sees for wrong shapes."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     """Every test starts from the same global seeds, alone or in the suite."""
