@@ -1,0 +1,150 @@
+"""Laws of completion: known content survives, unknown content never leaks, any size, any mixture, reproducible per view."""
+
+import dataclasses
+
+import pytest
+import torch
+from fb_core.geometry.cameras import Pinholes
+from fb_core.inpainter import Fillerbuster, SamplingConfig, noise_of
+from fb_core.views import Views
+from tiny_models import tiny_model
+
+QUICK = SamplingConfig(steps=2, guidance_unknown=3.0)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Fillerbuster:
+    return tiny_model(tmp_path_factory.mktemp("inpainter"))
+
+
+def cameras(count: int, width: int = 32, height: int = 32) -> Pinholes:
+    generator = seeded(7)
+    centers = torch.rand(count, 3, generator=generator) * 2 - 1
+    targets = centers + torch.randn(count, 3, generator=generator)
+    return Pinholes.looking_at(centers, targets, up=torch.tensor([0.0, 0.0, 1.0]), fov_degrees=60.0, width=width, height=height)
+
+
+def mixed_views(known: int = 2, partial: int = 1, unknown: int = 2, width: int = 32, height: int = 32) -> Views:
+    count = known + partial + unknown
+    views = Views.known(torch.rand(count, 3, height, width, generator=seeded(1)), cameras(count, width, height))
+    mask = torch.zeros(count, 1, height, width)
+    mask[:known] = 1
+    mask[known : known + partial, ..., : width // 2] = 1
+    return dataclasses.replace(views, image_known=mask)
+
+
+def test_known_pixels_and_rays_are_returned_as_given(model):
+    views = mixed_views()
+    done = model.complete(views, generator=seeded(), sampling=QUICK)
+    assert torch.equal(done.images * views.image_known, views.images * views.image_known)
+    assert torch.equal(done.raymaps, views.raymaps)
+    assert bool((done.image_known == 1).all()) and bool((done.rays_known == 1).all())
+    assert done.images.min() >= 0 and done.images.max() <= 1
+
+
+def test_what_stands_in_unknown_pixels_is_never_looked_at(model):
+    views = mixed_views()
+    poisoned = dataclasses.replace(views, images=torch.where(views.image_known > 0, views.images, torch.nan))
+    wanted = model.complete(views, generator=seeded(), sampling=QUICK)
+    got = model.complete(poisoned, generator=seeded(), sampling=QUICK)
+    assert torch.equal(got.images, wanted.images) and bool(torch.isfinite(got.images).all())
+
+
+def test_same_seed_same_bits_another_seed_another_sample(model):
+    views = mixed_views()
+    first, again, other = (model.complete(views, generator=seeded(s), sampling=QUICK).images for s in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_noise_of_a_view_does_not_depend_on_how_many_views_there_are():
+    assert torch.equal(noise_of(5, 3, (4, 4)), noise_of(5, 7, (4, 4))[:3])
+    assert not torch.equal(noise_of(5, 2, (4, 4))[0], noise_of(5, 2, (4, 4))[1])
+
+
+def test_permuting_views_permutes_the_output_without_index_embeddings(tmp_path, monkeypatch):
+    """With the noise permuted too; the first view stays first because it is the frame's reference."""
+    model = tiny_model(tmp_path, index="none")
+    views = mixed_views(known=2, partial=1, unknown=2)
+    noise = torch.randn(5, 32, 4, 4, generator=seeded(3))
+    order = [0, 3, 1, 4, 2]
+    import fb_core.inpainter as inpainter
+
+    monkeypatch.setattr(inpainter, "noise_of", lambda seed, count, size: noise)
+    straight = model.complete(views, generator=seeded(), sampling=QUICK)
+    monkeypatch.setattr(inpainter, "noise_of", lambda seed, count, size: noise[order])
+    permuted = model.complete(views[order], generator=seeded(), sampling=QUICK)
+    assert torch.allclose(permuted.images, straight.images[order], atol=1e-4)
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (48, 16), (33, 47), (17, 80)])
+def test_any_size_and_aspect_ratio(model, width, height):
+    views = mixed_views(width=width, height=height)
+    done = model.complete(views, generator=seeded(), sampling=QUICK)
+    assert done.size == (height, width) and bool(torch.isfinite(done.images).all())
+
+
+@pytest.mark.parametrize("mixture", [(1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 0, 3), (3, 0, 0), (1, 0, 63)])
+def test_any_number_of_views_and_any_mixture(model, mixture):
+    done = model.complete(mixed_views(*mixture), generator=seeded(), sampling=QUICK)
+    assert len(done) == sum(mixture) and bool(torch.isfinite(done.images).all())
+
+
+def test_rays_of_unposed_photos_are_recovered_as_unit_directions(model):
+    images = torch.rand(3, 3, 32, 32, generator=seeded(2))
+    done = model.complete(Views.unposed(images), generator=seeded(), sampling=QUICK)
+    assert torch.equal(done.images, images)
+    assert torch.allclose(done.raymaps[:, 3:].norm(dim=1), torch.ones(3, 32, 32), atol=1e-4)
+
+
+def test_posed_and_unposed_views_in_one_sequence(model):
+    posed = Views.known(torch.rand(2, 3, 32, 32, generator=seeded(2)), cameras(2))
+    both = Views.cat([posed, Views.unposed(torch.rand(1, 3, 32, 32, generator=seeded(3)))])
+    done = model.complete(both, generator=seeded(), sampling=QUICK)
+    assert torch.equal(done.raymaps[:2], posed.raymaps) and bool(torch.isfinite(done.raymaps).all())
+
+
+def test_the_answer_does_not_depend_on_where_and_how_large_the_scene_is(model):
+    """The canonical frame absorbs every similarity that keeps the reference camera's up."""
+    views = mixed_views()
+    frame_rotation = torch.linalg.qr(torch.randn(3, 3, generator=seeded(9)))[0]
+    frame_rotation *= torch.linalg.det(frame_rotation)
+    origins = 3.0 * torch.einsum("ij,njhw->nihw", frame_rotation, views.raymaps[:, :3]) + 10.0
+    directions = torch.einsum("ij,njhw->nihw", frame_rotation, views.raymaps[:, 3:])
+    moved = dataclasses.replace(views, raymaps=torch.cat([origins, directions], dim=1))
+    wanted = model.complete(views, generator=seeded(), sampling=QUICK).images
+    assert torch.allclose(model.complete(moved, generator=seeded(), sampling=QUICK).images, wanted, atol=2e-3)
+
+
+def test_progress_is_reported_per_step(model):
+    seen = []
+    model.complete(mixed_views(), generator=seeded(), sampling=QUICK, on_step=lambda done, of: seen.append((done, of)))
+    assert seen == [(1, 2), (2, 2)]
+
+
+def test_windows_complete_more_views_than_fit(model):
+    done = model.complete(mixed_views(2, 1, 4), generator=seeded(), sampling=dataclasses.replace(QUICK, window=3, rounds=2))
+    assert len(done) == 7 and bool(torch.isfinite(done.images).all())
+
+
+def test_bad_views_are_refused_with_one_sentence(model):
+    with pytest.raises(ValueError, match="at least 16x16 pixels, got 12x20"):
+        model.complete(mixed_views(width=12, height=20), generator=seeded())
+    with pytest.raises(ValueError, match="at least one view"):
+        model.complete(mixed_views()[[]], generator=seeded())
+    views = mixed_views()
+    broken = views.images.clone()
+    broken[0, :, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="1 known pixels are NaN"):
+        model.complete(dataclasses.replace(views, images=broken), generator=seeded())
+    with pytest.raises(ValueError, match="must lie in"):
+        model.complete(dataclasses.replace(views, image_known=views.image_known * 2), generator=seeded())
+
+
+@pytest.mark.parametrize("nonsense", [{"steps": 0}, {"solver": "magic"}, {"rounds": 0}, {"views_at_once": 0}, {"shift": -1.0}])
+def test_nonsense_sampling_is_refused(nonsense):
+    with pytest.raises(ValueError, match="expected"):
+        SamplingConfig(**nonsense)
