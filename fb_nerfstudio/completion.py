@@ -91,7 +91,7 @@ class CompletionConfig:
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Where the new cameras stand and look."""
     generated_share: float = 0.5
-    """Most of the training steps that generated views may take; where they are fewer than the captured, each view is drawn equally often."""
+    """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn equally often."""
     generated_pixels: Literal["all", "unseen"] = "all"
     """Train on whole generated views, or only on their pixels that the capture has not seen."""
     view_weight: float = 1.0

@@ -1,0 +1,125 @@
+"""What the capture has not seen: which pixels of generated views, how far away they are, and Gaussians to put there.
+
+Two sources tell what was seen: the captured cameras' frusta (always), and the splats' own accumulation and depth once they
+have been trained for a while.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Bool, Float
+from nerfstudio.models.base_model import Model
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.paths import seen_by
+from fb_core.geometry.shell import Shell, intersect
+from fb_nerfstudio.bridge import to_nerfstudio
+from fb_nerfstudio.completed_views import CompletedViews
+
+SOLID = 0.5
+"""Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
+TRAINED_STEPS = 100
+"""Steps after which the splats' own depth and accumulation are believed."""
+_DEPTH_SIDE = 64
+_BORDER_SHARE = 1 / 32  # unseen regions grow by this part of the picture, so that old and new overlap at the seam
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """What the splats look like from some cameras."""
+
+    depth: Float[Tensor, "n h w"]
+    """Expected z-depth in scene units; means nothing where accumulation is low."""
+    accumulation: Float[Tensor, "n h w"]
+    """Opacity in [0, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unseen:
+    """The part of generated views that the capture has not seen."""
+
+    mask: Bool[Tensor, "n h w"]
+    """True where unseen."""
+    points: Float[Tensor, "n h w 3"]
+    """World points of the pixels on the shell; infinite where a ray never meets it."""
+
+
+@torch.no_grad()
+def render_geometry(model: Model, cameras: Pinholes) -> Rendered:
+    """Depth and accumulation of the splats from each camera, in evaluation mode; the training mode is restored. On the CPU."""
+    was_training = model.training
+    model.eval()
+    try:
+        outputs = [model.get_outputs_for_camera(to_nerfstudio(cameras[index], model.device)) for index in range(len(cameras))]
+    finally:
+        model.train(was_training)
+    return Rendered(
+        depth=torch.stack([one["depth"][..., 0].float().cpu() for one in outputs]),
+        accumulation=torch.stack([one["accumulation"][..., 0].float().cpu() for one in outputs]),
+    )
+
+
+def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20000) -> Float[Tensor, "m 3"]:
+    """World points of what the splats show in the captured cameras (at most ``limit``, evenly spread over the pictures)."""
+    groups = []
+    for camera in cameras:
+        scale = min(1.0, _DEPTH_SIDE / max(camera.width, camera.height))
+        small = camera.to("cpu", torch.float32).scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        rendered = render_geometry(model, small)
+        solid = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
+        groups.append(small.unproject(rendered.depth)[solid])
+    points = torch.cat(groups) if groups else torch.empty(0, 3)
+    return points[torch.linspace(0, len(points) - 1, min(len(points), limit)).long()]
+
+
+def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shell, rendered: Rendered | None) -> Unseen:
+    """Which pixels of generated views show what the capture has not.
+
+    A pixel is seen when its surface point falls into a captured picture and, if ``rendered`` tells, splats cover it. The
+    surface point is the splats' where they cover the pixel and the shell's elsewhere.
+
+    Args:
+        views: the generated views.
+        captured: the capture's cameras.
+        shell: the guessed surface, for depth.
+        rendered: the splats from the views' cameras, or None while they are untrained.
+    """
+    cameras = views.cameras.to("cpu", torch.float32)
+    directions = cameras.directions()
+    origins = cameras.centers[:, None, None].expand_as(directions)
+    distance = intersect(shell, origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
+    points = origins + distance[..., None] * directions
+    surface, covered = points, torch.ones_like(distance, dtype=torch.bool)
+    if rendered is not None:
+        covered = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
+        surface = torch.where(covered[..., None], cameras.unproject(rendered.depth), points)
+    flat = surface.reshape(-1, 3)
+    inside = seen_by([camera.to("cpu", torch.float32) for camera in captured], torch.nan_to_num(flat, posinf=1e9, neginf=-1e9))
+    return Unseen(mask=~(covered & inside.reshape(covered.shape)), points=points)
+
+
+def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
+    """The views with masks that leave only their unseen pixels and a narrow seam around them."""
+    reach = max(1, round(views.images.shape[1] * _BORDER_SHARE))
+    grown = F.max_pool2d(unseen.mask[:, None].float(), 2 * reach + 1, stride=1, padding=reach) > 0
+    return dataclasses.replace(views, masks=rearrange(grown, "n 1 h w -> n h w 1"))
+
+
+def unseen_gaussians(
+    views: CompletedViews, unseen: Unseen, *, limit: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Points and colours in [0, 1] for Gaussians: a random subset of the unseen pixels, on the shell.
+
+    All views share the shell, so what they agree on lands in one place.
+    """
+    usable = unseen.mask & torch.isfinite(unseen.points).all(dim=-1)
+    points, colors = unseen.points[usable], views.images[usable].float() / 255
+    chosen = torch.randperm(len(points), generator=generator)[:limit]
+    return points[chosen], colors[chosen]

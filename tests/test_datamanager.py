@@ -1,0 +1,538 @@
+"""The datamanager in process at toy size: generation when due, mixing, persistence, resume, refusals, the viewer panel."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+
+from fb_core.data.captures import validate_capture
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.shell import sphere
+from fb_core.inpainter import SamplingConfig
+from fb_core.views import Views
+from fb_nerfstudio.completed_views import CompletedViews, Origin
+from fb_nerfstudio.completion import CompletionConfig
+from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
+from fb_nerfstudio.unseen import Rendered, find_unseen, unseen_gaussians, with_unseen_masks
+
+
+class GreyFiller:
+    """A stand-in for the diffusion model: unknown pixels become grey of the generator's first number."""
+
+    size, model_hash, loads, calls = 16, "feedbeef" * 8, 0, 0
+
+    def complete(self, views, *, generator, sampling=SamplingConfig(), on_step=None) -> Views:
+        GreyFiller.calls += 1
+        if on_step is not None:
+            on_step(1, 1)
+        torch.rand(5)  # careless use of the global random state, which training must not notice
+        images = torch.where(views.image_known > 0, views.images, torch.rand(1, generator=generator).expand_as(views.images))
+        ones = torch.ones_like(views.image_known)
+        return Views(images=images, image_known=ones, raymaps=views.raymaps, rays_known=ones)
+
+
+class ToySplats(torch.nn.Module):
+    """A stand-in for the splat model: sees a wall at depth 2 in the left half of every picture."""
+
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.added: list[tuple[torch.Tensor, torch.Tensor]] = []
+        self.modes: list[bool] = []
+
+    def get_outputs_for_camera(self, camera):
+        self.modes.append(self.training)
+        height, width = int(camera.height), int(camera.width)
+        accumulation = torch.zeros(height, width, 1)
+        accumulation[:, : width // 2] = 1.0
+        return {"depth": torch.full((height, width, 1), 2.0), "accumulation": accumulation}
+
+    def add_gaussians(self, points, colors, optimizers) -> int:
+        self.added.append((points, colors))
+        return len(points)
+
+
+class ToyTrainer:
+    """Saves what nerfstudio's trainer saves, as far as the datamanager is concerned."""
+
+    def __init__(self, folder: Path, pipeline) -> None:
+        self.base_dir, self.checkpoint_dir, self.pipeline = folder, folder / "nerfstudio_models", pipeline
+        self.config = SimpleNamespace(save_only_latest_checkpoint=True)
+
+    def save_checkpoint(self, step: int) -> None:
+        torch.save({"step": step, "pipeline": self.pipeline.datamanager.state_dict()}, self.checkpoint_dir / f"step-{step:09d}.ckpt")
+
+
+@pytest.fixture(autouse=True)
+def stand_in_model(monkeypatch):
+    """No test here loads real weights; the number of loads is counted."""
+    GreyFiller.loads = GreyFiller.calls = 0
+
+    def load(self):
+        GreyFiller.loads += 1
+        return GreyFiller()
+
+    monkeypatch.setattr(FillerbusterDataManager, "_load_inpainter", load)
+    monkeypatch.setattr(FillerbusterDataManager, "_check_inpainter", lambda self: None)
+
+
+def options(**changes) -> CompletionConfig:
+    return CompletionConfig(**{"context_views": 3, "anchor_views": 4, "densify_rounds": 1, "densify_views": 2, "steps": 2, **changes})
+
+
+def make(data: Path, completion: CompletionConfig | None = None, test_mode: str = "val", **changes) -> FillerbusterDataManager:
+    config = FillerbusterDataManagerConfig(
+        data=data,
+        dataparser=NerfstudioDataParserConfig(load_3D_points=changes.pop("points", True)),
+        completion=completion or options(),
+        cache_images_type=changes.pop("cache_images_type", "uint8"),
+        **changes,
+    )
+    return config.setup(device="cpu", test_mode=test_mode, world_size=1, local_rank=0)
+
+
+def attributes(manager: FillerbusterDataManager, folder: Path | None = None) -> TrainingCallbackAttributes:
+    pipeline = SimpleNamespace(datamanager=manager, model=ToySplats())
+    trainer = None if folder is None else ToyTrainer(folder, pipeline)
+    return TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=pipeline, trainer=trainer)
+
+
+def run_callbacks(manager: FillerbusterDataManager, attrs: TrainingCallbackAttributes, step: int = 0) -> None:
+    for callback in manager.get_training_callbacks(attrs):
+        callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+
+
+def generated(manager: FillerbusterDataManager, folder: Path | None = None, step: int = 0) -> TrainingCallbackAttributes:
+    attrs = attributes(manager, folder)
+    run_callbacks(manager, attrs, step)
+    return attrs
+
+
+def draws(manager: FillerbusterDataManager, steps: range) -> list[int | str]:
+    """Which view each step draws: the captured index, or "g" and the generated picture's sum."""
+    result = []
+    for step in steps:
+        camera, _ = manager.next_train(step)
+        cam_idx = (camera.metadata or {}).get("cam_idx")
+        result.append(cam_idx if cam_idx is not None else f"g{float(camera.camera_to_worlds.sum()):.5f}")
+    return result
+
+
+def test_nothing_is_generated_before_it_is_due(tiny_capture: Path):
+    manager = make(tiny_capture, options(at_step=5))
+    attrs = attributes(manager)
+    for step in range(5):
+        run_callbacks(manager, attrs, step)
+        assert manager.generated_views is None and GreyFiller.loads == 0
+    run_callbacks(manager, attrs, 5)
+    assert len(manager.generated_views) == 6 and GreyFiller.loads == 1 and GreyFiller.calls == 2
+    run_callbacks(manager, attrs, 6)
+    assert GreyFiller.loads == 1
+
+
+def test_a_run_without_completion_is_plain_nerfstudio(tiny_capture: Path):
+    manager = make(tiny_capture, options(enabled=False))
+    generated(manager)
+    assert manager.generated_views is None and GreyFiller.loads == 0
+    seen = draws(manager, range(12))
+    assert sorted(seen[:6]) == sorted(seen[6:]) == [0, 1, 2, 3, 4, 5]  # every view once per epoch
+
+
+def test_batches_have_what_the_splat_model_reads(tiny_capture: Path):
+    manager = make(tiny_capture, options(view_weight=0.25))
+    generated(manager)
+    kinds = {}
+    for step in range(60):
+        camera, batch = manager.next_train(step)
+        kinds["real" if "cam_idx" in (camera.metadata or {}) else "generated"] = (camera, batch)
+    camera, batch = kinds["generated"]
+    assert camera.shape == (1,) and not (camera.metadata or {})
+    assert batch["image"].shape == (16, 16, 3) and batch["image"].dtype == torch.uint8
+    assert batch["mask"].shape == (16, 16, 1) and batch["view_weight"] == 0.25
+    camera, batch = kinds["real"]
+    assert batch["image"].dtype == torch.uint8 and batch["image"].shape == (32, 48, 3) and "view_weight" not in batch
+
+
+def test_float_caches_give_float_generated_images(tiny_capture: Path):
+    manager = make(tiny_capture, options(generated_share=1.0), cache_images_type="float32")
+    generated(manager)
+    images = [batch["image"] for camera, batch in map(manager.next_train, range(30)) if not camera.metadata]
+    assert images and images[0].dtype == torch.float32 and 0 <= float(images[0].min()) <= float(images[0].max()) <= 1
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.2, 0.2), (1.0, 6 / 12), (0.0, 0.0)])
+def test_generated_views_are_drawn_with_the_stated_probability(tiny_capture: Path, share: float, expected: float):
+    manager = make(tiny_capture, options(generated_share=share))
+    generated(manager)
+    assert manager.generated_probability == pytest.approx(expected)
+    seen = draws(manager, range(400))
+    got = sum(isinstance(one, str) for one in seen) / len(seen)
+    assert got == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / 400) + 1e-9)
+    if share > 0:
+        assert len({one for one in seen if isinstance(one, str)}) == 6
+
+
+def test_the_dataset_never_grows(tiny_capture: Path):
+    manager = make(tiny_capture)
+    before = len(manager.train_dataset), len(manager.cached_train), len(manager.eval_dataset)
+    generated(manager)
+    assert (len(manager.train_dataset), len(manager.cached_train), len(manager.eval_dataset)) == before
+    assert len(manager.train_cameras) == before[0]
+
+
+def test_no_reference_to_pipeline_trainer_or_model_is_kept(tiny_capture: Path, tmp_path: Path):
+    manager = make(tiny_capture)
+    attrs = generated(manager, tmp_path)
+    assert [name for name, _ in manager.named_modules()] == [""]
+    assert not any(value in (attrs.pipeline, attrs.trainer, attrs) for value in vars(manager).values())
+    manager.train()
+    manager.eval()
+    assert list(manager.state_dict()) == ["_extra_state"]
+
+
+def test_generation_leaves_global_randomness_and_the_splats_mode_alone(tiny_capture: Path):
+    manager = make(tiny_capture)
+    torch.manual_seed(11)
+    expected = torch.rand(3)
+    torch.manual_seed(11)
+    attrs = attributes(manager)
+    attrs.pipeline.model.train()
+    run_callbacks(manager, attrs, 500)
+    assert torch.equal(torch.rand(3), expected)
+    assert attrs.pipeline.model.training and attrs.pipeline.model.modes and not any(attrs.pipeline.model.modes)
+
+
+def test_views_folder_and_checkpoint_are_there_when_training_goes_on(tiny_capture: Path, tmp_path: Path):
+    manager = make(tiny_capture)
+    generated(manager, tmp_path / "run")
+    assert len(validate_capture(tmp_path / "run" / "completion")) == 6
+    checkpoints = list((tmp_path / "run" / "nerfstudio_models").iterdir())
+    assert [path.name for path in checkpoints] == ["step-000000000.ckpt"]
+    assert [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")] == []
+    state = torch.load(checkpoints[0], weights_only=True)["pipeline"]["_extra_state"]
+    assert state["finished"] and len(state["views"]["origins"]) == 6
+
+
+def test_a_later_generation_counts_as_the_state_after_the_step_before(tiny_capture: Path, tmp_path: Path):
+    manager = make(tiny_capture, options(at_step=7))
+    generated(manager, tmp_path, step=7)
+    assert [path.name for path in (tmp_path / "nerfstudio_models").iterdir()] == ["step-000000006.ckpt"]
+
+
+def test_a_resumed_run_generates_nothing_and_draws_the_same_views(tiny_capture: Path, tmp_path: Path):
+    whole = make(tiny_capture)
+    generated(whole)
+    draws(whole, range(23))
+    buffer = io.BytesIO()
+    torch.save(whole.state_dict(), buffer)
+    expected = draws(whole, range(23, 80))
+    buffer.seek(0)
+    loads = GreyFiller.loads
+
+    resumed = make(tiny_capture)
+    resumed.load_state_dict(torch.load(buffer, weights_only=True), strict=False)
+    run_callbacks(resumed, attributes(resumed), 23)
+    assert GreyFiller.loads == loads
+    assert draws(resumed, range(23, 80)) == expected
+
+
+def test_a_run_killed_between_rounds_goes_on_with_the_next_round(tiny_capture: Path, tmp_path: Path, monkeypatch):
+    expected = make(tiny_capture)
+    generated(expected)
+
+    def killed(self, *_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    manager = make(tiny_capture)
+    with monkeypatch.context() as patch:
+        complete = GreyFiller.complete
+        calls = []
+        patch.setattr(GreyFiller, "complete", lambda *a, **k: killed(*a) if calls else calls.append(1) or complete(*a, **k))
+        with pytest.raises(KeyboardInterrupt):
+            generated(manager, tmp_path)
+    state = torch.load(tmp_path / "nerfstudio_models" / "step-000000000.ckpt", weights_only=True)["pipeline"]
+    assert not state["_extra_state"]["finished"] and len(state["_extra_state"]["views"]["origins"]) == 4
+
+    resumed = make(tiny_capture)
+    resumed.load_state_dict(state, strict=False)
+    GreyFiller.calls = 0
+    generated(resumed, tmp_path, step=1)
+    assert GreyFiller.calls == 1
+    assert torch.equal(resumed.generated_views.images, expected.generated_views.images)
+    assert torch.equal(resumed.generated_views.cameras.camera_to_world, expected.generated_views.cameras.camera_to_world)
+
+
+def test_checkpoints_of_other_methods_load(tiny_capture: Path):
+    manager = make(tiny_capture)
+    manager.load_state_dict({}, strict=False)
+    assert manager.generated_views is None
+
+
+@pytest.mark.parametrize("test_mode", ["test", "inference"])
+def test_evaluation_commands_restore_the_bank_without_the_model(tiny_capture: Path, test_mode: str):
+    trained = make(tiny_capture)
+    generated(trained)
+    state, loads = trained.state_dict(), GreyFiller.loads
+    manager = make(tiny_capture, test_mode=test_mode)
+    manager.load_state_dict(state, strict=False)
+    assert len(manager.generated_views) == 6 and GreyFiller.loads == loads
+
+
+def test_untrained_splats_are_not_asked_what_was_seen(tiny_capture: Path):
+    manager = make(tiny_capture)
+    attrs = generated(manager, step=0)
+    assert attrs.pipeline.model.modes == []
+    points, colors = attrs.pipeline.model.added[0]
+    assert points.shape == colors.shape and len(points) > 0 and torch.isfinite(points).all()
+
+
+def test_trained_splats_tell_where_the_holes_are(tiny_capture: Path):
+    manager = make(tiny_capture, options(at_step=200, max_seed_gaussians=50), points=False)
+    attrs = generated(manager, step=200)
+    assert len(attrs.pipeline.model.modes) == 6 + 6  # captured views for the surface, generated views for the holes
+    assert 0 < len(attrs.pipeline.model.added[0][0]) <= 50
+
+
+def test_no_gaussians_are_added_when_not_wanted(tiny_capture: Path):
+    manager = make(tiny_capture, options(seed_gaussians=False))
+    assert generated(manager).pipeline.model.added == []
+
+
+def test_training_on_unseen_pixels_alone_masks_the_rest(tiny_capture: Path):
+    manager = make(tiny_capture, options(generated_pixels="unseen"))
+    generated(manager)
+    masks = manager.generated_views.masks
+    assert 0 < int(masks.sum()) < masks.numel()
+
+
+def test_several_processes_are_refused(tiny_capture: Path):
+    with pytest.raises(ValueError, match="one process, got 2"):
+        FillerbusterDataManagerConfig(data=tiny_capture).setup(device="cpu", world_size=2)
+
+
+def test_a_broken_capture_is_refused_before_anything_is_loaded(tiny_capture: Path):
+    next((tiny_capture / "images").iterdir()).unlink()
+    with pytest.raises(Refused, match=r"view_\d+"):
+        make(tiny_capture)
+    with pytest.raises(ValueError, match="no such folder"):
+        make(tiny_capture / "nowhere")
+    (tiny_capture / "transforms.json").write_text("{")
+    with pytest.raises(ValueError, match="JSON"):
+        make(tiny_capture)
+
+
+def test_a_refusal_ends_a_command_with_its_sentence_and_code_one():
+    # The class itself, without the seconds that importing nerfstudio takes.
+    program = "class Refused(SystemExit, ValueError): pass\nraise Refused('the capture is empty')"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (1, "the capture is empty\n")
+    assert issubclass(Refused, SystemExit) and issubclass(Refused, ValueError)
+
+
+def test_a_bad_model_folder_is_refused_before_training(tiny_capture: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.undo()
+    manager = make(tiny_capture, options(model=tmp_path / "absent", at_step=1000))
+    with pytest.raises(Refused, match="absent"):
+        manager.get_training_callbacks(attributes(manager))
+
+
+def test_points_of_the_capture_come_without_open3d(tiny_capture: Path):
+    manager = make(tiny_capture)
+    outputs = manager.train_dataparser_outputs
+    points, colors = outputs.metadata["points3D_xyz"], outputs.metadata["points3D_rgb"]
+    assert points.shape == colors.shape == (50, 3) and colors.dtype == torch.uint8 and points.dtype == torch.float32
+    # Cameras and points went through one similarity: their distances keep their ratios.
+    before, after = validate_capture(tiny_capture), manager.train_dataset.cameras.camera_to_worlds[:, :, 3]
+    import trimesh
+
+    original = torch.from_numpy(trimesh.load(before.points_path).vertices.copy()).float()
+    names = [path.name for path in outputs.image_filenames]
+    place = {frame.image_path.name: frame.camera.centers[0].float() for frame in before.frames}
+    centers = torch.stack([place[name] for name in names])
+    ratio = torch.cdist(after, points) / torch.cdist(centers, original)
+    assert torch.allclose(ratio, torch.full_like(ratio, outputs.dataparser_scale), rtol=1e-4)
+
+
+def test_images_are_not_pinned_without_a_driver(tiny_capture: Path, monkeypatch):
+    def pinned(_):
+        raise RuntimeError("no driver")
+
+    monkeypatch.setattr(torch.Tensor, "pin_memory", pinned)
+    manager = make(tiny_capture, cache_images="cpu")  # what nerfstudio switches to beyond 500 images
+    assert len(manager.cached_train) == 6
+    manager.next_train(0)
+
+
+def test_the_config_survives_nerfstudios_yaml(tiny_capture: Path):
+    config = FillerbusterDataManagerConfig(data=tiny_capture, completion=options(model=Path("weights"), seed=7))
+    back = yaml.load(yaml.dump(config), Loader=yaml.Loader)
+    assert dataclasses.asdict(back.completion) == dataclasses.asdict(config.completion)
+    assert back._target is FillerbusterDataManager
+
+
+def test_every_option_is_a_flag_with_a_description(capsys):
+    import tyro
+
+    parsed = tyro.cli(CompletionConfig, args=["--anchor-views", "3", "--placement.radius", "0.5", "--model", "somewhere"])
+    assert parsed.anchor_views == 3 and parsed.placement.radius == 0.5 and parsed.model == Path("somewhere")
+    with pytest.raises(SystemExit):
+        tyro.cli(CompletionConfig, args=["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for field in dataclasses.fields(CompletionConfig):
+        assert field.name == "placement" or f"--{field.name.replace('_', '-')}" in text
+    assert "Views generated together in the first round" in text
+
+
+# ---- unseen pixels --------------------------------------------------------------------------------------------------
+
+
+def two_views() -> CompletedViews:
+    """One camera at the origin looking along +x, one along -x, 90 degrees wide."""
+    centers, ahead = torch.zeros(2, 3), torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
+    cameras = Pinholes.looking_at(centers, centers + ahead, up=torch.tensor([0.0, 0.0, 1.0]), fov_degrees=90.0, width=8, height=8)
+    images = torch.stack([torch.full((8, 8, 3), 255), torch.full((8, 8, 3), 51)]).to(torch.uint8)
+    origin = Origin(role="anchor", round=0, seed=0, prompt="", model_hash="")
+    return CompletedViews(images=images, masks=torch.ones(2, 8, 8, 1, dtype=torch.bool), cameras=cameras, origins=(origin, origin))
+
+
+def test_the_captured_direction_is_seen_and_the_other_is_not():
+    views = two_views()
+    captured = dataclasses.replace(views.cameras[0], focal=views.cameras.focal[:1] / 2)  # looks the same way, wider
+    unseen = find_unseen(views, [captured], sphere(torch.zeros(3), 3.0), None)
+    assert not unseen.mask[0].any() and unseen.mask[1].all()
+    assert torch.allclose(unseen.points.norm(dim=-1), torch.tensor(3.0), atol=1e-3)
+    points, colors = unseen_gaussians(views, unseen, limit=10, generator=torch.Generator().manual_seed(0))
+    assert points.shape == (10, 3) and bool((points[:, 0] < 0).all()) and torch.allclose(colors, torch.tensor(0.2))
+    masked = with_unseen_masks(views, unseen)
+    assert not masked.masks[0].any() and masked.masks[1].all()
+
+
+def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at():
+    views = two_views()
+    captured = dataclasses.replace(views.cameras[0], focal=views.cameras.focal[:1] / 2)
+    accumulation = torch.ones(2, 8, 8)
+    accumulation[0, :, 4:] = 0.1
+    unseen = find_unseen(
+        views, [captured], sphere(torch.zeros(3), 3.0), Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=accumulation)
+    )
+    assert not unseen.mask[0, :, :4].any() and unseen.mask[0, :, 4:].all() and unseen.mask[1].all()
+    grown = with_unseen_masks(views, unseen)
+    assert grown.masks[0, :, 3].all() and not grown.masks[0, :, :3].any()
+
+
+# ---- viewer ---------------------------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Stands for viser's server: remembers nodes and switches."""
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, SimpleNamespace] = {}
+        self.boxes: dict[str, SimpleNamespace] = {}
+        self.scene = self.gui = self
+
+    def _node(self, name, **values):
+        handle = SimpleNamespace(visible=True, remove=lambda: self.nodes.pop(name), on_click=lambda func: func, **values)
+        self.nodes[name] = handle
+        return handle
+
+    def add_frame(self, name, **values):
+        return self._node(name, **values)
+
+    def add_camera_frustum(self, name, **values):
+        return self._node(name, **values)
+
+    def add_folder(self, label, order=None):
+        return _NoContext()
+
+    def add_markdown(self, content):
+        self.status = SimpleNamespace(content=content)
+        return self.status
+
+    def add_checkbox(self, label, initial_value):
+        box = SimpleNamespace(value=initial_value, remove=lambda: self.boxes.pop(label), callbacks=[])
+        box.on_update = box.callbacks.append
+        self.boxes[label] = box
+        return box
+
+    def switch(self, label: str, value: bool) -> None:
+        self.boxes[label].value = value
+        for callback in self.boxes[label].callbacks:
+            callback(None)
+
+
+class _NoContext:
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+
+def toy_viewer() -> SimpleNamespace:
+    viewer = SimpleNamespace(viser_server=Recorder(), config=SimpleNamespace(camera_frustum_scale=0.1), camera_handles={})
+    viewer.visible = []
+    viewer.set_camera_visibility = viewer.visible.append
+    return viewer
+
+
+def test_without_a_viewer_the_panel_does_nothing(tiny_capture: Path):
+    manager = make(tiny_capture)
+    generated(manager)
+    assert not manager.completion_panel.is_open
+
+
+def test_frustums_stand_in_one_group_per_round_with_a_switch_each(tiny_capture: Path):
+    manager, viewer = make(tiny_capture), toy_viewer()
+    manager.completion_panel._setup(viewer)
+    server = viewer.viser_server
+    assert list(server.boxes) == ["Captured (6)"] and "No generated" in server.status.content
+    generated(manager)
+    assert list(server.boxes) == ["Captured (6)", "Anchors (4)", "Round 1 (2)"]
+    assert len([name for name in server.nodes if "view_" in name]) == 6
+    assert server.status.content == "6 generated views"
+    server.switch("Anchors (4)", False)
+    assert not server.nodes["/completion/round_00"].visible and server.nodes["/completion/round_01"].visible
+    server.switch("Captured (6)", False)
+    assert viewer.visible == [False]
+    frustum, camera = server.nodes["/completion/round_00/view_000"], manager.generated_views.cameras
+    assert torch.allclose(torch.from_numpy(frustum.position).float(), 10 * camera.centers[0], atol=1e-5)
+    assert frustum.image.shape == (16, 16, 3)
+
+
+def test_a_saved_run_is_drawn_whether_the_viewer_comes_first_or_last(tiny_capture: Path):
+    trained = make(tiny_capture)
+    generated(trained)
+    state = trained.state_dict()
+    for viewer_first in (True, False):
+        manager, viewer = make(tiny_capture, test_mode="test"), toy_viewer()
+        if viewer_first:  # ns-train --load-dir
+            manager.completion_panel._setup(viewer)
+        manager.load_state_dict(state, strict=False)
+        if not viewer_first:  # ns-viewer
+            manager.completion_panel._setup(viewer)
+        assert len([name for name in viewer.viser_server.nodes if "view_" in name]) == 6
+        manager._set_bank(None)
+        assert viewer.viser_server.nodes == {}
+
+
+def test_nerfstudios_viewer_finds_the_panel(tiny_capture: Path):
+    from nerfstudio.viewer.utils import parse_object
+    from nerfstudio.viewer.viewer_elements import ViewerControl
+
+    manager = make(tiny_capture)
+    holder = torch.nn.Module()
+    holder.datamanager = manager
+    assert [found for _, found in parse_object(holder, ViewerControl, "Custom Elements")] == [manager.completion_panel]
