@@ -24,7 +24,8 @@ from fb_core.conditioning import (
     split,
 )
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
-from fb_core.sampler import OnStep, Predict, guidance_map, guided, integrate, tiled, time_grid
+from fb_core.networks.prepared import Prepared
+from fb_core.sampler import OnStep, branches, guidance_map, guided, integrate, tiled, time_grid
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
@@ -100,11 +101,6 @@ class Fillerbuster:
         """Where the weights are."""
         return next(self.dit.parameters()).device
 
-    def predict(self, sequence: Float[Tensor, "b n 66 h w"], time: Float[Tensor, "b"]) -> Float[Tensor, "b n 32 h w"]:
-        """The transformer's velocity with the model's own text embedding."""
-        text = None if self.text is None else self.text.expand(len(sequence), -1, -1)
-        return self.dit(sequence, time, text)
-
     @torch.no_grad()
     def complete(
         self,
@@ -154,11 +150,14 @@ class Fillerbuster:
         """Latents at t = 0."""
         null = encode_null(conditioning, image_vae=self.image_vae, raymap_vae=self.raymap_vae, pixels=pixels)
         partitions = torch.Generator().manual_seed(_mixed(seed, -1))
-        predict: Predict = tiled(self.predict, window=sampling.window, rounds=sampling.rounds, generator=partitions)
         scale = guidance_map(conditioning, known=sampling.guidance_known, unknown=sampling.guidance_unknown)
-        field = guided(predict, conditioning, null, scale)
+        times = time_grid(sampling.steps, shift=sampling.shift)
+        channels = torch.stack([part.channels for part in branches(conditioning, null, scale)])
+        text = None if self.text is None else self.text[None]
+        prepared = Prepared(self.dit, channels, times[:-1], text=text)
+        predict = tiled(prepared, window=sampling.window, rounds=sampling.rounds, generator=partitions)
         noise = noise_of(seed, conditioning.channels.shape[0], tuple(conditioning.channels.shape[-2:])).to(self.device)
-        return integrate(field, noise, time_grid(sampling.steps, shift=sampling.shift), solver=sampling.solver, on_step=on_step)
+        return integrate(guided(predict, scale), noise, times, solver=sampling.solver, on_step=on_step)
 
     def _decode(self, views: Views, latents: Tensor, frame: CanonicalFrame | None, sampling: SamplingConfig) -> Views:
         """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not decoded."""

@@ -1,8 +1,8 @@
 """Sampling: integrate a velocity from noise (t = 1) to data (t = 0); guidance and MultiDiffusion are wrappers of callables.
 
-``integrate(guided(tiled(predict), ...), noise, times)``: `predict` maps a joined sequence [b, n, 66, h, w] and times [b] to
-velocities [b, n, 32, h, w]; `tiled` keeps that signature; `guided` binds the conditioning and returns a velocity field
-[n, 32, h, w], t -> [n, 32, h, w]. Tiling sits inside guidance, so the guidance map never leaves its views.
+``integrate(guided(tiled(predict), ...), noise, times)``: `predict` evaluates the network on some of the views under every branch of
+guidance at once, `tiled` keeps that signature, and `guided` makes a velocity field of it. Tiling sits inside guidance, so the guidance
+map never leaves its views.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from fb_core.conditioning import Conditioning, join, unsplit
+from fb_core.conditioning import LATENT_CHANNELS, Conditioning, join, unsplit
 
-Predict = Callable[..., Float[Tensor, "b n 32 h w"]]
-"""(sequence [b, n, 66, h, w], time [b]) -> velocity [b, n, 32, h, w]."""
+Predict = Callable[[Float[Tensor, "n 32 h w"], float, Int[Tensor, "n"] | None], Float[Tensor, "b n 32 h w"]]
+"""(state of some views, time, which views they are (None: all)) -> velocity under each branch of guidance."""
 VelocityField = Callable[[Float[Tensor, "n 32 h w"], float], Float[Tensor, "n 32 h w"]]
+"""dz/dt at a state and a time."""
 OnStep = Callable[[int, int], None]
 """(steps done, steps in all), called after every step."""
 
@@ -65,31 +66,37 @@ def guidance_map(conditioning: Conditioning, *, known: float, unknown: float) ->
     """Guidance scale per latent: the known scale where known, the unknown scale elsewhere, each modality by its own mask."""
     image = unknown + (known - unknown) * conditioning.image_known
     rays = unknown + (known - unknown) * conditioning.rays_known
-    half = 16
-    return unsplit(image.expand(*image.shape[:-3], half, *image.shape[-2:]), rays.expand(*rays.shape[:-3], half, *rays.shape[-2:]))
+    return unsplit(image.expand(-1, LATENT_CHANNELS, -1, -1), rays.expand(-1, LATENT_CHANNELS, -1, -1))
 
 
-def guided(
-    predict: Predict, conditioning: Conditioning, null: Conditioning, scale: Float[Tensor, "n 32 h w"], *, one_batch: bool = True
-) -> VelocityField:
-    """Classifier-free guidance v = u + scale (c - u) with a scale per latent; a scale of 1 everywhere costs one branch only.
+def branches(conditioning: Conditioning, null: Conditioning, scale: Float[Tensor, "n 32 h w"]) -> list[Conditioning]:
+    """What guidance has to evaluate: (null, conditional), or only the conditional branch when the scale is 1 everywhere."""
+    return [conditioning] if bool((scale == 1).all()) else [null, conditioning]
 
-    ``one_batch`` evaluates both branches together (faster, twice the activations); otherwise one after the other. The
-    combination is in float32 because a scale of 7 amplifies the branches' rounding 13 times.
+
+def evaluated_by(network: Callable[[Tensor, Tensor], Tensor], parts: list[Conditioning]) -> Predict:
+    """The plain way to evaluate branches: join state and conditioning and run the network (sequence, times) on all of it, every time."""
+
+    def predict(state: Tensor, time: float, views: Tensor | None = None) -> Tensor:
+        chosen = slice(None) if views is None else views
+        sequences = torch.stack([join(state, Conditioning(channels=part.channels[chosen])) for part in parts])
+        return network(sequences, state.new_full((len(parts),), time))
+
+    return predict
+
+
+def guided(predict: Predict, scale: Float[Tensor, "n 32 h w"]) -> VelocityField:
+    """Classifier-free guidance v = u + scale (c - u) with a scale per latent; `predict` gives (u, c), or c alone (see `branches`).
+
+    The combination is in float32: a scale of 7 amplifies the rounding of the branches 13 times.
     """
-    without_guidance = bool((scale == 1).all())
 
     def field(state: Tensor, time: float) -> Tensor:
-        conditional = join(state, conditioning)[None]
-        if without_guidance:
-            return predict(conditional, state.new_full((1,), time))[0].float()
-        unconditional = join(state, null)[None]
-        if one_batch:
-            u, c = predict(torch.cat([unconditional, conditional]), state.new_full((2,), time)).float()
-        else:
-            u = predict(unconditional, state.new_full((1,), time))[0].float()
-            c = predict(conditional, state.new_full((1,), time))[0].float()
-        return u + scale * (c - u)
+        velocities = predict(state, time, None).float()
+        if len(velocities) == 1:
+            return velocities[0]
+        unconditional, conditional = velocities
+        return unconditional + scale * (conditional - unconditional)
 
     return field
 
@@ -119,21 +126,21 @@ def tiled(predict: Predict, *, window: int | None, rounds: int = 1, generator: t
     if rounds < 1:
         raise ValueError(f"rounds: expected at least 1, got {rounds}")
 
-    def predict_tiled(sequence: Tensor, time: Tensor) -> Tensor:
-        count = sequence.shape[1]
+    def predict_tiled(state: Tensor, time: float, views: Tensor | None = None) -> Tensor:
+        count = len(state)
         if window is None or window >= count:
-            return predict(sequence, time)
+            return predict(state, time, views)
         total: Tensor | None = None
-        visits = torch.zeros(count, device=sequence.device)
+        visits = torch.zeros(count, device=state.device)
         for _ in range(rounds):
             order = torch.arange(count) if generator is None else torch.randperm(count, generator=generator)
-            for views in windows(count, window, order=order.to(sequence.device)):
-                part = predict(sequence[:, views], time).float()
+            for part in windows(count, window, order=order.to(state.device)):
+                velocities = predict(state[part], time, part if views is None else views[part]).float()
                 if total is None:
-                    total = part.new_zeros(part.shape[0], count, *part.shape[2:])
-                total.index_add_(1, views, part)
-                visits.index_add_(0, views, torch.ones_like(views, dtype=visits.dtype))
+                    total = velocities.new_zeros(len(velocities), count, *velocities.shape[2:])
+                total.index_add_(1, part, velocities)
+                visits.index_add_(0, part, torch.ones_like(part, dtype=visits.dtype))
         assert total is not None
-        return total / visits[None, :, None, None, None]
+        return total / visits[:, None, None, None]
 
     return predict_tiled

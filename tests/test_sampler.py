@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from fb_core.conditioning import CONDITIONING_CHANNELS, Conditioning
-from fb_core.sampler import guidance_map, guided, integrate, tiled, time_grid, windows
+from fb_core.sampler import branches, evaluated_by, guidance_map, guided, integrate, tiled, time_grid, windows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +20,7 @@ def random_conditioning(views: int, seed: int = 0) -> Conditioning:
     return Conditioning(channels=channels)
 
 
-def per_view_predict(sequence: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+def per_view_network(sequence: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
     """A network that treats views independently (so that windows cannot matter) and depends on state, conditioning and time."""
     return torch.tanh(sequence[:, :, :32]) * time[:, None, None, None, None] + sequence[:, :, 32:64] - sequence[:, :, 64:65]
 
@@ -72,22 +72,21 @@ def test_guidance_of_scale_one_is_the_conditional_prediction_and_costs_one_branc
 
     def counting(sequence, time):
         calls.append(len(sequence))
-        return per_view_predict(sequence, time)
+        return per_view_network(sequence, time)
 
-    state = torch.randn(3, 32, 4, 6, generator=seeded())
-    got = guided(counting, conditioning, null, torch.ones(3, 32, 4, 6))(state, 0.5)
-    wanted = per_view_predict(torch.cat([state, conditioning.channels], dim=1)[None], torch.tensor([0.5]))[0]
+    state, scale = torch.randn(3, 32, 4, 6, generator=seeded()), torch.ones(3, 32, 4, 6)
+    got = guided(evaluated_by(counting, branches(conditioning, null, scale)), scale)(state, 0.5)
+    wanted = per_view_network(torch.cat([state, conditioning.channels], dim=1)[None], torch.tensor([0.5]))[0]
     assert torch.equal(got, wanted) and calls == [1]
 
 
-def test_guidance_extrapolates_from_null_and_batching_does_not_matter():
+def test_guidance_extrapolates_from_null_through_the_conditional_prediction():
     conditioning, null = random_conditioning(3), random_conditioning(3, seed=1)
     state = torch.randn(3, 32, 4, 6, generator=seeded())
     scale = torch.rand(3, 32, 4, 6, generator=seeded(2)) * 7
-    together = guided(per_view_predict, conditioning, null, scale)(state, 0.3)
-    apart = guided(per_view_predict, conditioning, null, scale, one_batch=False)(state, 0.3)
-    u, c = (per_view_predict(torch.cat([state, x.channels], dim=1)[None], torch.tensor([0.3]))[0] for x in (null, conditioning))
-    assert torch.allclose(together, u + scale * (c - u), atol=1e-6) and torch.allclose(apart, together, atol=1e-6)
+    got = guided(evaluated_by(per_view_network, branches(conditioning, null, scale)), scale)(state, 0.3)
+    u, c = (per_view_network(torch.cat([state, x.channels], dim=1)[None], torch.tensor([0.3]))[0] for x in (null, conditioning))
+    assert torch.allclose(got, u + scale * (c - u), atol=1e-6)
 
 
 def test_guidance_map_has_the_known_scale_where_known_per_modality():
@@ -107,8 +106,9 @@ def test_guidance_map_follows_its_views_under_any_permutation(order, window):
 
     def sample(views: list[int]) -> torch.Tensor:
         chosen = Conditioning(channels=conditioning.channels[views])
-        predict = tiled(per_view_predict, window=window, rounds=2, generator=seeded(4))
-        field = guided(predict, chosen, Conditioning(channels=null.channels[views]), guidance_map(chosen, known=1.1, unknown=7.0))
+        scale = guidance_map(chosen, known=1.1, unknown=7.0)
+        predict = evaluated_by(per_view_network, branches(chosen, Conditioning(channels=null.channels[views]), scale))
+        field = guided(tiled(predict, window=window, rounds=2, generator=seeded(4)), scale)
         return integrate(field, noise[views], time_grid(4), solver="ab2")
 
     assert torch.allclose(sample(list(order)), sample([0, 1, 2, 3, 4])[list(order)], atol=1e-4)
@@ -125,25 +125,26 @@ def test_windows_are_full_have_no_repeats_and_visit_every_view(count, size, seed
 
 
 def test_a_window_that_holds_everything_is_one_call_in_the_given_order():
-    sequence = torch.randn(2, 5, 66, 4, 6, generator=seeded())
+    state = torch.randn(5, 32, 4, 6, generator=seeded())
     seen = []
 
-    def predict(part, time):
-        seen.append(part)
-        return part[:, :, :32]
+    def predict(part, time, views):
+        seen.append((part, views))
+        return part[None]
 
-    tiled(predict, window=8, rounds=3, generator=seeded())(sequence, torch.ones(2))
-    assert len(seen) == 1 and torch.equal(seen[0], sequence)
+    tiled(predict, window=8, rounds=3, generator=seeded())(state, 1.0)
+    assert len(seen) == 1 and torch.equal(seen[0][0], state) and seen[0][1] is None
 
 
 @pytest.mark.parametrize("window", [1, 2, 3, 7])
 def test_tiling_does_not_change_a_network_that_treats_views_independently(window):
-    sequence, time = torch.randn(2, 7, 66, 4, 6, generator=seeded()), torch.tensor([0.5, 0.7])
-    tiles = tiled(per_view_predict, window=window, rounds=3, generator=seeded())(sequence, time)
-    assert torch.allclose(tiles, per_view_predict(sequence, time), atol=1e-6)
+    state = torch.randn(7, 32, 4, 6, generator=seeded())
+    predict = evaluated_by(per_view_network, [random_conditioning(7), random_conditioning(7, seed=1)])
+    tiles = tiled(predict, window=window, rounds=3, generator=seeded())(state, 0.5)
+    assert torch.allclose(tiles, predict(state, 0.5), atol=1e-6)
 
 
 @pytest.mark.parametrize("arguments", [{"window": 0}, {"window": 2, "rounds": 0}])
 def test_tiling_refuses_nonsense(arguments):
     with pytest.raises(ValueError, match="at least 1"):
-        tiled(per_view_predict, **arguments)
+        tiled(evaluated_by(per_view_network, [random_conditioning(2)]), **arguments)

@@ -192,10 +192,22 @@ def make_room(seed: int, family: RoomFamily) -> Room:
     solids = _furnish(rng, family, size, joiner) + _dress_walls(rng, family, size, joiner)
     if rng.random() < 0.3:
         solids.append(_rug(rng, size, joiner))
-    solids.sort(key=lambda solid: KINDS.index(solid.kind))
-    shell = Solid(kind="box", center=(0.0, 0.0, size[2] / 2), half=tuple(s / 2 for s in size), material=shell_materials[0])
-    materials = [*shell_materials, *(solid.material for solid in solids)]
-    solids = [shell, *solids]
+    return build_room(solids, shell_materials, size=size, light=light, ambient=ambient, seed=seed, family=family)
+
+
+def build_room(
+    solids: list[Solid],
+    shell_materials: list[Material],
+    *,
+    size: tuple[float, float, float],
+    light: tuple[float, float, float],
+    ambient: float,
+    seed: int,
+    family: RoomFamily,
+) -> Room:
+    """A room of given solids in world coordinates (any order of kinds); six shell materials for -x, +x, -y, +y, floor, ceiling."""
+    shell = Solid(kind="box", center=(0.0, 0.0, size[2] / 2), half=(size[0] / 2, size[1] / 2, size[2] / 2), material=shell_materials[0])
+    solids = [shell, *sorted(solids, key=lambda solid: KINDS.index(solid.kind))]
     return Room(
         seed=seed,
         family=family,
@@ -205,7 +217,7 @@ def make_room(seed: int, family: RoomFamily) -> Room:
         headings=torch.tensor([solid.heading for solid in solids], dtype=torch.float32),
         light=torch.tensor(light, dtype=torch.float32),
         ambient=torch.tensor(ambient, dtype=torch.float32),
-        **_material_tensors(materials),
+        **_material_tensors([*shell_materials, *(solid.material for solid in solids[1:])]),
     )
 
 
