@@ -1,0 +1,104 @@
+"""nerfstudio methods: `fillerbuster`, and `fillerbuster-none`, the same without completion.
+
+The TrainerConfigs are built from parts: nerfstudio discovers plugins in the middle of importing its own
+`configs.method_configs`, which therefore must not be imported here. This module is paid by every `ns-*` command.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from fb_nerfstudio.datamanager import FillerbusterDataManagerConfig
+from fb_nerfstudio.fused_adam import FusedAdamOptimizerConfig
+from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
+from fb_nerfstudio.splat_model import FillerbusterSplatModelConfig
+
+_ON_GPU = torch.cuda.is_available()
+_ITERATIONS = 30000 if _ON_GPU else 3000
+
+
+def _model() -> FillerbusterSplatModelConfig:
+    """Splatfacto's defaults; without a GPU fewer Gaussians, simpler colours and a schedule of a tenth of the length."""
+    if _ON_GPU:
+        return FillerbusterSplatModelConfig()
+    return FillerbusterSplatModelConfig(
+        max_gaussians=20000,
+        num_random=10000,
+        sh_degree=1,
+        num_downscales=0,
+        warmup_length=300,
+        stop_screen_size_at=1000,
+        stop_split_at=2000,
+        normal_loss_from=2000,
+    )
+
+
+def _optimizers() -> dict[str, Any]:
+    """Splatfacto's learning rates; the decay of the means ends with the training."""
+
+    def adam(lr: float, scheduler: FloatExponentialDecaySchedulerConfig | None = None) -> dict[str, Any]:
+        return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": scheduler}
+
+    def decay(lr_final: float, warmup_steps: int = 0) -> FloatExponentialDecaySchedulerConfig:
+        return FloatExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=_ITERATIONS, warmup_steps=warmup_steps, lr_pre_warmup=0.0)
+
+    return {
+        "means": adam(1.6e-4, decay(1.6e-6)),
+        "features_dc": adam(2.5e-3),
+        "features_rest": adam(2.5e-3 / 20),
+        "opacities": adam(5e-2),
+        "scales": adam(5e-3),
+        "quats": adam(1e-3),
+        "camera_opt": adam(1e-4, decay(5e-7, warmup_steps=1000)),
+        "bilateral_grid": adam(2e-3, decay(1e-4, warmup_steps=1000)),
+    }
+
+
+def _trainer() -> TrainerConfig:
+    return TrainerConfig(
+        method_name="fillerbuster",
+        machine=MachineConfig(device_type="cuda" if _ON_GPU else "cpu"),
+        max_num_iterations=_ITERATIONS,
+        steps_per_save=2000 if _ON_GPU else 1000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=100 if _ON_GPU else 500,
+        steps_per_eval_all_images=1000,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            datamanager=FillerbusterDataManagerConfig(
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+            ),
+            model=_model(),
+        ),
+        optimizers=_optimizers(),
+        # Listens on this machine only; depth would hide the frustums of generated views that stand behind a wall.
+        viewer=ViewerConfig(websocket_host="127.0.0.1", num_rays_per_chunk=1 << 15, default_composite_depth=False),
+        vis="viewer",
+    )
+
+
+def without_completion(config: TrainerConfig, method_name: str) -> TrainerConfig:
+    """A copy under another name whose datamanager generates nothing; everything else is equal."""
+    other = copy.deepcopy(config)
+    other.method_name = method_name
+    other.pipeline.datamanager.completion = dataclasses.replace(other.pipeline.datamanager.completion, enabled=False)
+    return other
+
+
+fillerbuster = MethodSpecification(
+    config=_trainer(),
+    description="Complete a casual capture with multi-view diffusion, then train Gaussian splats on captured and generated views.",
+)
+fillerbuster_none = MethodSpecification(
+    config=without_completion(fillerbuster.config, "fillerbuster-none"),
+    description="The splats of fillerbuster on the captured views only (baseline).",
+)

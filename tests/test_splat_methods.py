@@ -1,0 +1,99 @@
+"""The nerfstudio methods: importable first, light, parsable, differing only where they say so."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from importlib.metadata import requires
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+from packaging.requirements import Requirement
+
+from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
+from method_configs.splats import fillerbuster, fillerbuster_none
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+HEAVY = {"kornia", "trimesh", "pyvista", "OpenImageIO", "transformers", "diffusers", "open3d"}
+
+
+def differences(first, second, path: str = "") -> dict[str, tuple]:
+    """Dotted names of all fields in which two configs differ."""
+    if dataclasses.is_dataclass(first) and not isinstance(first, type) and type(first) is type(second):
+        pairs = [(field.name, getattr(first, field.name), getattr(second, field.name)) for field in dataclasses.fields(first)]
+    elif isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
+        pairs = [(key, first[key], second[key]) for key in first]
+    else:
+        return {} if first == second else {path: (first, second)}
+    found: dict[str, tuple] = {}
+    for name, one, other in pairs:
+        found |= differences(one, other, f"{path}.{name}" if path else str(name))
+    return found
+
+
+def test_the_baseline_differs_in_completion_only() -> None:
+    assert differences(fillerbuster.config, fillerbuster_none.config) == {
+        "method_name": ("fillerbuster", "fillerbuster-none"),
+        "pipeline.datamanager.completion.enabled": (True, False),
+    }
+
+
+def test_defaults_that_users_rely_on() -> None:
+    config = fillerbuster.config
+    assert config.viewer.websocket_host == "127.0.0.1" and not config.viewer.default_composite_depth
+    assert config.machine.device_type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert not config.mixed_precision and not config.viewer.quit_on_train_completion
+    schedulers = [group["scheduler"] for group in config.optimizers.values() if group["scheduler"] is not None]
+    assert schedulers and all(isinstance(scheduler, FloatExponentialDecaySchedulerConfig) for scheduler in schedulers)
+    model = config.pipeline.model
+    assert (model.normal_alignment, model.normal_alignment_weight, model.ssim_lambda) == ("squared", 0.01, 0.2)
+
+
+def test_the_command_line_reaches_our_options() -> None:
+    arguments = ["--max-num-iterations", "5", "--pipeline.model.max-gaussians", "100", "--pipeline.datamanager.completion.enabled", "False"]
+    arguments += ["--pipeline.model.normal-alignment", "absolute", "--optimizers.means.optimizer.fused", "False"]
+    config = tyro.cli(tyro.conf.FlagConversionOff[TrainerConfig], default=fillerbuster.config, args=arguments)
+    assert config.max_num_iterations == 5 and config.pipeline.model.max_gaussians == 100
+    assert not config.pipeline.datamanager.completion.enabled and config.pipeline.model.normal_alignment == "absolute"
+    assert not config.optimizers["means"]["optimizer"].fused
+
+
+def test_a_config_survives_yaml() -> None:
+    """nerfstudio writes config.yml as Python objects and every later command reads it back."""
+    again = yaml.load(yaml.dump(fillerbuster.config), Loader=yaml.Loader)
+    assert differences(fillerbuster.config, again) == {}
+
+
+@pytest.mark.timeout(180)
+def test_imports_first_and_adds_less_than_a_second() -> None:
+    """In a fresh interpreter the entry point is imported before anything of nerfstudio, and what it loads beyond
+    nerfstudio and nerfstudio's own requirements takes less than a second (on a busy machine: 5 % of the whole)."""
+    script = f"import sys, method_configs.splats as m; print(m.fillerbuster.config.method_name, sorted({HEAVY!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-X", "importtime", "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip().splitlines()[-1] == "fillerbuster []"
+    own, whole = own_import_seconds(done.stderr)
+    assert own < max(1.0, 0.05 * whole)
+
+
+def own_import_seconds(report: str) -> tuple[float, float]:
+    """Seconds of an importtime report outside nerfstudio, its requirements, the standard library and what they import; all seconds."""
+    foreign = {"nerfstudio"} | {Requirement(line).name.replace("-", "_").lower() for line in requires("nerfstudio") or []}
+    foreign |= {"pil", "cv2", "sklearn"} | set(sys.stdlib_module_names)
+    own, whole, ancestors = 0.0, 0.0, []
+    for line in reversed(report.splitlines()):  # children stand before their parent, one step further in
+        parts = line.removeprefix("import time:").split("|")
+        if len(parts) != 3 or not parts[0].strip().isdigit():
+            continue
+        depth = (len(parts[2]) - len(parts[2].lstrip()) - 1) // 2
+        name = parts[2].strip()
+        ancestors = [*ancestors[:depth], name.split(".")[0].lower()]
+        seconds = int(parts[0]) * 1e-6
+        whole += seconds
+        own += 0.0 if foreign & set(ancestors) else seconds
+    return own, whole
