@@ -295,7 +295,7 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
     )
 
 
-def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, int]) -> str:
+def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, ...]) -> str:
     height, width = frame.camera.height, frame.camera.width
     told = f"{kind} {path}: expected {width} x {height} pixels as its camera says, got {stored[1]} x {stored[0]}"
     if stored == (width, height) and media.image_size(path) == (height, width):

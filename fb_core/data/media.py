@@ -230,7 +230,7 @@ def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
 def _opened_heif(path: Path):
     """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency."""
     try:
-        import pillow_heif
+        import pillow_heif  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError(
             f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install 'fillerbuster[heic]' or convert to JPEG"
@@ -264,7 +264,7 @@ def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: 
     kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
     spec = oiio.ImageSpec(width, height, count, kinds[array.dtype.name])
     if names is not None:
-        spec.channelnames = names
+        spec.channelnames = tuple(names)
     for key, value in attributes.items():
         spec.attribute(key, value)
     done = writer.open(str(path), spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()

@@ -50,7 +50,7 @@ def undistort(
     straight, to_bent = (_fisheye_map if camera_model in FISHEYE_MODELS else _perspective_map)(camera, distortion)
     colours = torch.where(mask > 0, image, torch.zeros_like(image))  # unknown colours may be anything, NaN included
     bent = rearrange(torch.cat([colours, mask]), "c h w -> h w c").contiguous().numpy()
-    result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
     result = rearrange(torch.from_numpy(result), "h w c -> c h w")
     return result[:3].contiguous(), (result[3:] > 1 - 1e-4).to(mask.dtype), straight
 
@@ -76,7 +76,7 @@ def _perspective_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pi
     size = (camera.width, camera.height)
     matrix = _matrix(camera)
     straight, _ = cv2.getOptimalNewCameraMatrix(matrix, coefficients, size, 0)
-    maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, straight, size, cv2.CV_32FC1)
+    maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), straight, size, cv2.CV_32FC1)
     return _with_matrix(camera, straight), maps
 
 
