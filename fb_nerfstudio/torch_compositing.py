@@ -34,11 +34,11 @@ from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses, Strips, lis
 from fb_nerfstudio.torch_projection import ALPHA_MIN
 
 TRANSMITTANCE_MIN = 1e-4
-PAIRS_PER_BLOCK = 2**17
+PAIRS_PER_BLOCK = 2**18
 ROWS_PER_LIST = 2**20
 _NEVER = -1e4
-_TERMS = 6
-# Shape of a block, found by measuring: 16 ranks x 128 cells x 64 pixels. Deeper where there are fewer cells.
+_TERMS, _COLUMNS = 6, 11
+# Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels. Deeper where there are fewer cells.
 _SHALLOWEST, _DEEPEST, _DEEPEST_THIN = 16, 64, 1024
 _THIN = 128
 
@@ -80,32 +80,28 @@ def composite(
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """Columns of the chosen Gaussians, and the constants of the grid."""
+    """What a block needs to know, one row for each chosen Gaussian (one gather fetches all of it)."""
 
-    ellipses: Ellipses
-    log_opacity: Float[Tensor, " v"]
-    values: Float[Tensor, "v d1"]
-    """With a last channel of ones, which composites to alpha."""
+    rows: Float[Tensor, "v r"]
+    """log2(opacity), two blanks, -A/2, -B, -C/2, x, y, A, B, C, the values, 1; conic entries times log2(e)."""
     monomials: Float[Tensor, "6 p"]
-    center_x: Float[Tensor, " cells"]
-    center_y: Float[Tensor, " cells"]
+    centers: Float[Tensor, "2 cells"]
     alpha_threshold: float
     """The largest number below 1/255."""
-    cap: float
-    log_cap: float
+    cap: float | None
+    """Largest alpha; None where no opacity reaches it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Block:
     """B ranks deep, S cells wide, P pixels each; where two of them are one index the order is (b, s)."""
 
-    width: int
-    """S: the block covers the first S cells of its stretch."""
     splats: Int32[Tensor, " bs"]
     """Rows of the table; padding points at some row and has alpha 0."""
-    dx: Float[Tensor, " bs"]
-    dy: Float[Tensor, " bs"]
-    """Mean less cell centre."""
+    columns: Float[Tensor, "11 bs"]
+    """Coefficients k0 .. k5, dx and dy (mean less cell centre), A, B, C: to the base 2 like the table."""
+    values: Float[Tensor, "b s d1"]
+    """Channels, and a last one of ones, which composites to alpha."""
     alpha: Float[Tensor, "b s p"]
     light: Float[Tensor, "b s p"]
     """Transmittance in front of each."""
@@ -137,18 +133,22 @@ def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
 
 def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _Table:
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
-    center_x, center_y = grid.centers(values)
+    rows = values.new_empty(values.shape[0], _COLUMNS + values.shape[1] + 1)
+    A, B, C = (column * math.log2(math.e) for column in (ellipses.A, ellipses.B, ellipses.C))
+    blank = torch.zeros_like(A)
+    torch.stack(
+        [ellipses.opacity.log2(), blank, blank, -0.5 * A, -B, -0.5 * C, ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :_COLUMNS]
+    )
+    rows[:, _COLUMNS:-1] = values
+    rows[:, -1] = 1.0
+    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
+    may_cap = values.shape[0] > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
     return _Table(
-        ellipses=ellipses,
-        log_opacity=ellipses.opacity.log(),
-        values=torch.cat([values, torch.ones_like(values[:, :1])], dim=1),
+        rows=rows,
         monomials=_monomials(grid.size, values),
-        center_x=center_x,
-        center_y=center_y,
+        centers=torch.stack(grid.centers(values)),
         alpha_threshold=float(below),
-        cap=cap,
-        # A little slack: the polynomial may round an exponent to slightly above log(opacity).
-        log_cap=math.log(cap) - 1e-3,
+        cap=cap if may_cap else None,
     )
 
 
@@ -161,65 +161,67 @@ class _Stretch:
         self._counts, self._starts, self._rank = counts, starts, rank
 
     def blocks(self, table: _Table, listed: Tensor, transmittance: Tensor, scratch: _Scratch, budget: int) -> Iterator[_Block]:
-        """The blocks in order; at the end the cells' transmittance [cells, p] is up to date."""
-        pixels, rank, deepest = table.monomials.shape[1], self._rank, int(self._counts[0])
-        light = transmittance.index_select(0, self.cells)
+        """The blocks in order, covering the first cells of the stretch; at the end their transmittance [cells, p] is up to date."""
+        pixels, rank, lengths = table.monomials.shape[1], self._rank, self._counts.tolist()
+        centers = table.centers.index_select(1, self.cells)[:, None]
+        light, deepest, width = transmittance.index_select(0, self.cells), lengths[0], len(lengths)
         while rank < deepest:
-            width = int((self._counts > rank).sum())  # the counts descend: finished cells are at the end
+            while lengths[width - 1] <= rank:  # long lists come first, so finished cells are at the end
+                width -= 1
             most = _DEEPEST if width * pixels >= _THIN else _DEEPEST_THIN
             depth = min(max(_SHALLOWEST, budget // (width * pixels)), most, deepest - rank)
-            block = self._block(table, listed, light[:width], rank, depth, scratch)
-            after = scratch.take("light", depth + 1, width, pixels)[depth]
-            light[:width] = after
-            opaque = float(after.min()) <= TRANSMITTANCE_MIN
-            if opaque:
-                _stop(block.alpha, scratch.take("light", depth + 1, width, pixels)[1:])
+            splats, padding = self._pick(listed, rank, depth, width, full=lengths[width - 1] >= rank + depth)
+            block, after = _block(table, splats, padding, centers[..., :width], light[:width], depth, scratch)
+            light[:width] = after[-1]
             rank += depth
+            opaque = float(after[-1].min()) <= TRANSMITTANCE_MIN
+            if opaque:
+                _stop(block.alpha, after)
             yield block
             if opaque and rank < deepest:
-                open_cells = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
-                if int(open_cells.sum()) <= 0.75 * width:
-                    kept = open_cells.nonzero()[:, 0]
+                still = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
+                if int(still.sum()) <= 0.75 * width:
+                    kept = still.nonzero()[:, 0]
                     if kept.numel():
                         self.rest = _Stretch(*(column.index_select(0, kept) for column in (self.cells, self._counts, self._starts)), rank)
                     break
         transmittance.index_copy_(0, self.cells, light)
 
-    def _block(self, table: _Table, listed: Tensor, light: Tensor, rank: int, depth: int, scratch: _Scratch) -> _Block:
-        width, pixels = light.shape
-        ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=light.device)[:, None]
-        padding = ranks >= self._counts[:width]
-        splats = listed.index_select(0, (ranks + self._starts[:width]).masked_fill_(padding, 0).view(-1))
-        log_opacity = table.log_opacity.index_select(0, splats)
-        may_cap = float(log_opacity.max()) > table.log_cap
-        k, dx, dy = _coefficients(table, splats, log_opacity, self.cells[:width], padding, scratch)
-        alpha = torch.mm(k.t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
-        alpha = F.threshold_(alpha.exp_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
-        capped = None
-        if may_cap:
-            capped = alpha > table.cap
-            alpha.clamp_(max=table.cap)
-        lights = scratch.take("light", depth + 1, width, pixels)
-        lights[0] = light
-        _darken(alpha, lights)
-        return _Block(width=width, splats=splats, dx=dx, dy=dy, alpha=alpha, light=lights[:depth], capped=capped)
+    def _pick(self, listed: Tensor, rank: int, depth: int, width: int, full: bool) -> tuple[Tensor, Tensor | None]:
+        """Table rows of the ranks rank .. rank + depth of the first `width` cells, and what of it is padding."""
+        ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=listed.device)[:, None]
+        positions = ranks + self._starts[:width]
+        padding = None if full else ranks >= self._counts[:width]
+        if padding is not None:
+            positions.masked_fill_(padding, 0)
+        return listed.index_select(0, positions.view(-1)), padding
 
 
-def _coefficients(table: _Table, splats: Tensor, log_opacity: Tensor, cells: Tensor, padding: Tensor, scratch: _Scratch):
-    """The polynomials [6, b s] of the listed Gaussians around their cells' centres, and mean less centre."""
-    ellipses, shape = table.ellipses, padding.shape
-    k = scratch.take("coefficients", _TERMS, splats.numel())
-    A, B, C = (column.index_select(0, splats) for column in (ellipses.A, ellipses.B, ellipses.C))
-    dx = ellipses.x.index_select(0, splats).view(shape).sub_(table.center_x.index_select(0, cells)).view(-1)
-    dy = ellipses.y.index_select(0, splats).view(shape).sub_(table.center_y.index_select(0, cells)).view(-1)
-    torch.mul(A, dx, out=k[1]).addcmul_(B, dy)
-    torch.mul(B, dx, out=k[2]).addcmul_(C, dy)
-    torch.addcmul(log_opacity, dx, k[1], value=-0.5, out=k[0]).addcmul_(dy, k[2], value=-0.5)
-    k[0].masked_fill_(padding.view(-1), _NEVER)
-    torch.mul(A, -0.5, out=k[3])
-    torch.neg(B, out=k[4])
-    torch.mul(C, -0.5, out=k[5])
-    return k, dx, dy
+def _block(
+    table: _Table, splats: Tensor, padding: Tensor | None, centers: Tensor, light: Tensor, depth: int, scratch: _Scratch
+) -> tuple[_Block, Tensor]:
+    """Evaluate all pairs; also returns the transmittance behind each [b, s, p]."""
+    width, pixels = light.shape
+    rows = table.rows.index_select(0, splats)
+    k = scratch.take("columns", _COLUMNS, depth * width).copy_(rows[:, :_COLUMNS].t())
+    k[6:8].view(2, depth, width).sub_(centers)
+    dx, dy = k[6], k[7]
+    torch.mul(k[8:10], dx, out=k[1:3]).addcmul_(k[9:11], dy)
+    k[0].addcmul_(dx, k[1], value=-0.5).addcmul_(dy, k[2], value=-0.5)
+    if padding is not None:
+        k[0].masked_fill_(padding.view(-1), _NEVER)
+    alpha = torch.mm(k[:_TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
+    # To the base 2 because torch's exp2 is twice as fast as its exp.
+    alpha = F.threshold_(alpha.exp2_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
+    capped = None
+    if table.cap is not None and float(alpha.max()) > table.cap:
+        capped = alpha > table.cap
+        alpha.clamp_(max=table.cap)
+    lights = scratch.take("light", depth + 1, width, pixels)
+    lights[0] = light
+    _darken(alpha, lights)
+    values = rows[:, _COLUMNS:].view(depth, width, -1)
+    return _Block(splats=splats, columns=k, values=values, alpha=alpha, light=lights[:depth], capped=capped), lights[1:]
 
 
 def _darken(alpha: Tensor, lights: Tensor) -> None:
@@ -228,8 +230,7 @@ def _darken(alpha: Tensor, lights: Tensor) -> None:
     if alpha[0].numel() < _THIN:  # one slow scan beats very many tiny calls
         torch.cumprod(lights, dim=0, out=lights)
         return
-    layers = lights.unbind(0)
-    for before, after in pairwise(layers):
+    for before, after in pairwise(lights.unbind(0)):
         after.mul_(before)
 
 
@@ -248,36 +249,23 @@ def _march(lists: CellLists, width: int) -> Iterator[_Stretch]:
             stretch = stretch.rest
 
 
-def _forward_block(block: _Block, table: _Table, image: Tensor, scratch: _Scratch) -> None:
+def _forward_block(block: _Block, image: Tensor, scratch: _Scratch) -> None:
     """Add the block to the cells [s, d1, p] of its stretch."""
     weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", *block.alpha.shape))
-    values = table.values.index_select(0, block.splats).view(-1, block.width, table.values.shape[1])
-    image[: block.width].baddbmm_(values.permute(1, 2, 0), weights.permute(1, 0, 2))
+    image[: weights.shape[1]].baddbmm_(block.values.permute(1, 2, 0), weights.permute(1, 0, 2))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Sums:
-    """Gradients collected by row of the table."""
+def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: _Scratch):
+    """Add the block's gradients to `sums` [v, 6 + 2 + d1]; `behind` [s, p], the part of the loss that lies behind, is advanced in place.
 
-    moments: Float[Tensor, "v 6"]
-    """Sums of g times 1, dx, dy, dx^2, dx dy, dy^2, with d = mean - pixel."""
-    values: Float[Tensor, "v d1"]
-    absolute: Float[Tensor, "v 2"] | None
-    """Sums of |d loss / d mean2d| by pixel."""
-
-
-def _backward_block(block: _Block, table: _Table, upstream: Tensor, behind: Tensor, sums: _Sums, scratch: _Scratch) -> None:
-    """Add the block's gradients; `behind` [s, p], the part of the loss that lies behind, is advanced in place."""
+    The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls, then the values.
+    """
     depth, width, pixels = block.alpha.shape
     upstream, behind = upstream[:width], behind[:width]
-    # index_add_ is several times faster with 64-bit indices
-    splats = block.splats.long()
-    by_cell = splats.view(depth, width).t().reshape(-1)
+    new = scratch.take("new", depth * width, sums.shape[1])
     weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", depth, width, pixels))
-    v_values = torch.bmm(upstream, weights.permute(1, 2, 0))
-    sums.values.index_add_(0, by_cell, v_values.transpose(1, 2).reshape(depth * width, -1))
-    values = table.values.index_select(0, by_cell).view(width, depth, -1)
-    seen = torch.bmm(values, upstream, out=scratch.take("seen", width, depth, pixels))
+    new[:, _TERMS + 2 :].view(depth, width, -1).copy_(torch.bmm(upstream, weights.permute(1, 2, 0)).permute(2, 0, 1))
+    seen = torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
     share = weights.mul_(seen.permute(1, 0, 2))
     rest = scratch.take("rest", depth, width, pixels)
     front = behind
@@ -290,31 +278,31 @@ def _backward_block(block: _Block, table: _Table, upstream: Tensor, behind: Tens
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
-    sums.moments.index_add_(0, splats, _central_moments(block, torch.mm(table.monomials, g.t())))
-    if sums.absolute is not None:
-        sums.absolute.index_add_(0, splats, _absolute_pulls(block, table, g, scratch))
+    new[:, :_TERMS] = _central_moments(block.columns[6:8], torch.mm(monomials, g.t())).t()
+    if absgrad:
+        new[:, _TERMS : _TERMS + 2] = _absolute_pulls(block.columns, monomials, g, scratch).t()
+    else:
+        new[:, _TERMS : _TERMS + 2] = 0.0
+    sums.index_add_(0, block.splats.long(), new)  # several times faster with 64-bit indices
 
 
-def _central_moments(block: _Block, local: Float[Tensor, "6 bs"]) -> Float[Tensor, "bs 6"]:
-    """Shift sums of g times monomials of (u, v) about the cell centre to d = (dx - u, dy - v) about the mean."""
-    m, mu, mv, muu, muv, mvv = local.unbind(0)
-    dx, dy = block.dx, block.dy
-    mx, my = dx * m - mu, dy * m - mv
-    mxx = (mx - mu).mul_(dx).add_(muu)
-    mxy = (dx * my).addcmul_(dy, mu, value=-1.0).add_(muv)
-    myy = (my - mv).mul_(dy).add_(mvv)
-    return torch.stack([m, mx, my, mxx, mxy, myy], dim=1)
+def _central_moments(d: Float[Tensor, "2 bs"], local: Float[Tensor, "6 bs"]) -> Float[Tensor, "6 bs"]:
+    """Shift sums of g times monomials of (u, v) about the cell centre to (x, y) = d - (u, v) about the mean: 1, x, y, xx, xy, yy."""
+    total, offsets, cross = local[0], local[1:3], local[4]
+    first = (d * total).sub_(offsets)
+    squares = (first - offsets).mul_(d).add_(local[3::2])
+    mixed = (d[0] * first[1]).addcmul_(d[1], offsets[0], value=-1.0).add_(cross)
+    return torch.stack([total, first[0], first[1], squares[0], mixed, squares[1]])
 
 
-def _absolute_pulls(block: _Block, table: _Table, g: Tensor, scratch: _Scratch) -> Float[Tensor, "bs 2"]:
+def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, scratch: _Scratch) -> Float[Tensor, "2 bs"]:
     """Sums over pixels of |g| |conic d|, the gradient of the mean before its signs cancel; conic d is linear in (u, v). Uses g up."""
-    A, B, C = (column.index_select(0, block.splats) for column in (table.ellipses.A, table.ellipses.B, table.ellipses.C))
     size, sums = g.abs_(), []
-    for p, q in ((A, B), (B, C)):
-        line = torch.stack([(p * block.dx).addcmul_(q, block.dy), -p, -q])
-        pull = torch.mm(line.t(), table.monomials[:3], out=scratch.take("rest", *g.shape))
+    for constant, along_u, along_v in ((1, 8, 9), (2, 9, 10)):
+        line = torch.stack([columns[constant], -columns[along_u], -columns[along_v]])
+        pull = torch.mm(line.t(), monomials[:3], out=scratch.take("rest", *g.shape))
         sums.append(pull.abs_().mul_(size).sum(dim=1))
-    return torch.stack(sums, dim=1)
+    return torch.stack(sums).mul_(math.log(2.0))
 
 
 def _lists(ellipses: Ellipses, strips: Strips, grid: CellGrid, budget: int, transmittance: Tensor) -> Iterator[CellLists]:
@@ -349,7 +337,7 @@ class _Composite(torch.autograd.Function):
                 for stretch in _march(lists, settings.cells_per_block(pixels)):
                     local = image.new_zeros(stretch.cells.shape[0], *image.shape[1:])
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
-                        _forward_block(block, table, local, scratch)
+                        _forward_block(block, local, scratch)
                     image.index_add_(0, stretch.cells, local)
             out = _to_image(image, grid)
             colors, alphas = out[..., :-1].contiguous(), out[..., -1:].contiguous()
@@ -367,28 +355,23 @@ class _Composite(torch.autograd.Function):
             upstream = _to_cells(torch.cat([v_colors, v_alphas], dim=-1), grid)
             behind = (image * upstream).sum(dim=1)
             transmittance = torch.ones_like(behind)
-            number = values.shape[0]
-            sums = _Sums(
-                moments=values.new_zeros(number, _TERMS),
-                values=torch.zeros_like(table.values),
-                absolute=values.new_zeros(number, 2) if settings.absgrad else None,
-            )
+            sums = values.new_zeros(values.shape[0], _TERMS + 2 + upstream.shape[1])
             for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
                 for stretch in _march(lists, settings.cells_per_block(behind.shape[1])):
                     arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
-                        _backward_block(block, table, arriving, hidden, sums, scratch)
+                        _backward_block(block, table.monomials, arriving, hidden, sums, settings.absgrad, scratch)
                     behind.index_copy_(0, stretch.cells, hidden)
-            m, mx, my, mxx, mxy, myy = sums.moments.t().contiguous().unbind(0)
+            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, : _TERMS + 2].t().contiguous().unbind(0)
             A, B, C = ellipses.A, ellipses.B, ellipses.C
 
             def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
                 flat = like.new_zeros(means2d.shape[0] * means2d.shape[1], len(columns))
                 return flat.index_copy_(0, chosen.long(), torch.stack(columns, dim=1)).view(like.shape)
 
-            if sums.absolute is not None:
-                means2d.absgrad = dense(means2d, list(sums.absolute.unbind(1)))
+            if settings.absgrad:
+                means2d.absgrad = dense(means2d, [pull_x, pull_y])
             v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
             v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
             v_opacities = dense(opacities, [m / ellipses.opacity])
-        return v_means2d, v_conics, v_opacities, sums.values[:, :-1], None, None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, _TERMS + 2 : -1], None, None, None, None
