@@ -95,7 +95,7 @@ def demo(
     *,
     output: Path = Path("outputs/demo"),
     seed: int = 0,
-    iterations: int = 600,
+    iterations: int = 1500,
     model: Path | None = None,
 ) -> None:
     """Complete a small room from end to end and compare with plain splatting, on this machine.
@@ -154,7 +154,7 @@ def _show_log() -> None:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, show_level=False, markup=False)
+    handler = RichHandler(console=Console(stderr=True, soft_wrap=True), show_time=False, show_path=False, show_level=False, markup=False)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
     for package in ("fb_core", "fb_nerfstudio", "method_configs"):
         logging.getLogger(package).setLevel(logging.INFO)

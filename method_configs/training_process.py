@@ -1,0 +1,103 @@
+"""``ns-train`` as a child process whose progress (generated views, training steps) is read from what it prints."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+Report = Callable[[str, int, int], None]
+"""(phase, done, total); the phase is ``generate`` (denoising steps of all rounds) or ``train`` (iterations)."""
+
+_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
+_TRAINING_STEP = re.compile(r"(\d+) \(\d+\.\d+%\)")
+_DENOISING_STEP = re.compile(r"(?:Anchors|Round (\d+)): \d+ views\D*?(\d+)/(\d+)\s")
+_WINDOW = 4000  # characters that are searched for the latest progress
+
+
+class TrainingProcess:
+    """One running ``ns-train`` on the cores it is given; everything it prints goes to a file."""
+
+    def __init__(self, arguments: Sequence[str], *, log: Path, iterations: int, rounds: int, threads: int, report: Report):
+        """Starts at once.
+
+        Args:
+            arguments: what follows ``ns-train``.
+            log: file for the output.
+            iterations: training steps that were asked for.
+            rounds: rounds of generated views that were asked for (0 without completion).
+            threads: threads that torch may use.
+            report: told of progress, from another thread.
+        """
+        self.name, self.log, self.seconds = arguments[0], log, {"generate": 0.0, "all": 0.0}
+        self._iterations, self._rounds, self._report = iterations, rounds, report
+        self._began = time.monotonic()
+        self._generating_since: float | None = None
+        # A forced terminal makes rich print the bars of the generation into the pipe, where they are read below.
+        surroundings = {"FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "120", "PYTHONUNBUFFERED": "1"}
+        self._child = subprocess.Popen(
+            [str(Path(sys.executable).with_name("ns-train")), *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **surroundings, "OMP_NUM_THREADS": str(threads)},
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether the training has not ended yet."""
+        return self._child.poll() is None
+
+    def finish(self) -> None:
+        """Wait for the end. Raises ValueError with the last line of the output when the training failed."""
+        code = self._child.wait()
+        self._reader.join()
+        if code != 0:
+            lines = [line for line in self.log.read_text(encoding="utf-8").splitlines() if line.strip()]
+            last = lines[-1].strip() if lines else "no output"
+            raise ValueError(f"ns-train {self.name} ended with code {code}: {last} (all of its output: {self.log})")
+
+    def stop(self) -> None:
+        """End the training if it still runs."""
+        if self.running:
+            self._child.terminate()
+            try:
+                self._child.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                self._child.kill()
+        self._reader.join(timeout=10)
+
+    def _read(self) -> None:
+        assert self._child.stdout is not None
+        window = ""
+        with self.log.open("w", encoding="utf-8") as log:
+            while chunk := os.read(self._child.stdout.fileno(), 1 << 16):
+                text = chunk.decode("utf-8", errors="replace")
+                window = (window + text)[-_WINDOW:]
+                log.write(_ESCAPES.sub("", text))
+                log.flush()
+                self._follow(_ESCAPES.sub("", window))
+        self._child.stdout.close()
+        self.seconds["all"] = time.monotonic() - self._began
+
+    def _follow(self, text: str) -> None:
+        """Report the latest progress that ``text`` tells of."""
+        if (step := _last(_TRAINING_STEP, text)) is not None:
+            self._report("train", min(int(step[1]) + 1, self._iterations), self._iterations)
+        elif (step := _last(_DENOISING_STEP, text)) is not None:
+            now = time.monotonic()
+            self._generating_since = self._generating_since or now
+            self.seconds["generate"] = now - self._generating_since
+            done, total = int(step[2]), int(step[3])
+            self._report("generate", int(step[1] or 0) * total + done, self._rounds * total)
+
+
+def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    return next(iter(reversed(list(pattern.finditer(text)))), None)
