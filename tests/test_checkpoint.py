@@ -15,7 +15,6 @@ import fb_core.checkpoint as checkpoint
 from fb_core.checkpoint import convert, load, model_hash, read_config, save
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.released import STATE_KEYS, read_released
-from fb_core.networks.text import TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
 
 INFO = {"command": "train rooms-tiny", "seed": 3, "loss": [0.5, 0.25]}
@@ -334,9 +333,3 @@ def test_released_files_that_are_missing_truncated_or_strange(released, tmp_path
     with pytest.raises(ValueError, match="there is no folder"):
         convert(tmp_path / "nowhere", output)
     assert not output.exists()
-
-
-def test_prompts_without_their_package_or_weights_say_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "transformers", None)
-    with pytest.raises(ValueError, match=r"pip install 'fillerbuster\[text\]'"):
-        TextEncoder.from_folder(tmp_path)
