@@ -50,7 +50,7 @@ class PlacementConfig:
     """Densified views fill the cylinder from this radius outwards (same unit)."""
     height: float = 1.0
     """Spread of the cameras' heights, in units of the capture's own."""
-    max_pitch_degrees: float = 30.0
+    max_pitch_degrees: float = 45.0
     """Steepest look up or down in captures that look outward (rooms)."""
     target_spread: float = 0.7
     """How far from the focus cameras look in captures that look inward (objects), in units of the capture's radius."""
@@ -344,7 +344,7 @@ def _thinned(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, "m 3"]
 def _shell_of(shape: CaptureShape, points: Tensor) -> Shell:
     """The surface all around; without points, a sphere that leaves the cameras room."""
     guess = (3.0 if shape.outward else 2.0) * shape.radius
-    return fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0)
+    return fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up)
 
 
 def _clear_centers(

@@ -62,6 +62,30 @@ def test_a_few_stray_points_do_not_move_the_shell():
     assert float((shell.radius(directions(300, seed=3)) - 2.0).abs().max()) < 0.02
 
 
+def test_floor_and_ceiling_go_on_where_they_were_not_seen():
+    half, up = torch.tensor([2.0, 1.5, 1.2]), torch.tensor([0.0, 0.0, 1.0])
+    unit = directions(6000)
+    seen = unit[unit[:, 0] > 0.2]
+    points = seen * on_box(seen, half)[:, None]
+    behind = directions(2000, seed=4)
+    behind = behind[(behind[:, 0] < 0) & (half[2] / behind[:, 2].abs() < on_box(behind, half) + 1e-4)]  # rays to the unseen floor, ceiling
+    truth = on_box(behind, half)
+    errors = {}
+    for name, axis in (("with", up), ("without", None)):
+        shell = fit_shell(points, center=torch.zeros(3), fallback_radius=1.0, up=axis)
+        errors[name] = float((shell.radius(behind) / truth).log().abs().mean())
+    assert errors["with"] < 0.1 and errors["with"] < 0.6 * errors["without"]
+
+
+def test_points_without_a_flat_top_have_no_ceiling():
+    points, up = 2.5 * directions(2000), torch.tensor([0.0, 0.6, 0.8])
+    scattered = points * (0.5 + torch.rand(2000, 1, generator=torch.Generator().manual_seed(0)))
+    probe = directions(200, seed=1)
+    for cloud in (points, scattered):
+        with_up = fit_shell(cloud, center=torch.zeros(3), fallback_radius=1.0, up=up).radius(probe)
+        assert torch.allclose(with_up, fit_shell(cloud, center=torch.zeros(3), fallback_radius=1.0).radius(probe), rtol=0.05)
+
+
 def test_few_points_give_a_sphere_at_their_median_distance_and_none_the_fallback():
     few = fit_shell(CENTER + directions(5) * torch.tensor([1.0, 2.0, 3.0, 4.0, 50.0])[:, None], center=CENTER, fallback_radius=9.0)
     assert torch.allclose(few.radius(directions(20)), torch.tensor(3.0), atol=1e-5)

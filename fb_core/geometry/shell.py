@@ -18,6 +18,7 @@ _COLUMNS = 96
 _FIT_POINTS = 4096  # more points change the regression by less than its own smoothing
 _POWER = 3  # weights fall with the sixth power of the angle: local where points are dense, an average where there are none
 _OUTLIER_QUANTILE = 0.02
+_FLAT_SHARE, _FLAT_THICKNESS = 0.04, 0.03  # a floor or ceiling: this share of all points within this part of their distance
 _BISECTIONS = 24
 
 
@@ -62,6 +63,7 @@ def fit_shell(
     *,
     center: Float[Tensor, "3"],
     fallback_radius: float,
+    up: Float[Tensor, "3"] | None = None,
     bandwidth_degrees: float = 5.0,
     fewest_points: int = 16,
 ) -> Shell:
@@ -74,6 +76,7 @@ def fit_shell(
         points: surface points in world coordinates, from any source (structure from motion, rendered depth).
         center: the point the shell is star-shaped about; must see the scene, such as the middle of the captured cameras.
         fallback_radius: radius of the sphere that is returned when there is no usable point at all.
+        up: unit direction; when given, a flat floor or ceiling among the points goes on where none was seen.
         bandwidth_degrees: angular smoothing.
         fewest_points: with fewer usable points the result is a sphere at their median distance.
     """
@@ -91,9 +94,13 @@ def fit_shell(
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))
     log_distance = log_distance.clamp(bounds[0], bounds[1])
     # 1 - cos(angle) is half the squared angle for small angles.
-    half_square = (_table_directions(center) @ (offset / distance[:, None]).T).clamp(max=1.0).neg_().add_(1.0)
+    directions = _table_directions(center)
+    half_square = (directions @ (offset / distance[:, None]).T).clamp(max=1.0).neg_().add_(1.0)
     weight = half_square.add_(math.radians(bandwidth_degrees) ** 2 / 2).pow_(-_POWER)
     table = (weight @ log_distance) / weight.sum(dim=1)
+    if up is not None:
+        for axis in (up, -up):
+            table = torch.minimum(table, _log_distance_to_plane(offset @ axis, float(distance.median()), directions @ axis))
     return Shell(center=center, log_radius=table.reshape(_ROWS, _COLUMNS))
 
 
@@ -133,6 +140,20 @@ def intersect(shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Ten
         is_outside = outside(middle)
         near, far = torch.where(is_outside, near, middle), torch.where(is_outside, middle, far)
     return torch.where(hit, (near + far) / 2, torch.full_like(far, torch.inf))
+
+
+def _log_distance_to_plane(heights: Float[Tensor, "n"], typical: float, rise: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
+    """Log-distance along directions with the given rise (cosine to the axis) to the plane that the highest points lie on.
+
+    Infinite for directions that do not rise, and everywhere when the highest points do not lie on one plane above the centre.
+    """
+    infinite = torch.full_like(rise, torch.inf)
+    top = torch.quantile(heights, 1 - _OUTLIER_QUANTILE)
+    on_plane = (heights - top).abs() < _FLAT_THICKNESS * typical
+    if float(on_plane.to(heights).mean()) < _FLAT_SHARE or float(top) < 0.1 * typical:
+        return infinite
+    plane = heights[on_plane].median()
+    return torch.where(rise > 1e-3, (plane / rise.clamp(min=1e-3)).log(), infinite)
 
 
 def _table_directions(like: Tensor) -> Float[Tensor, "m 3"]:
