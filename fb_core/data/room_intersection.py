@@ -7,6 +7,7 @@ tables are filled up with solids that no ray reaches.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -60,7 +61,7 @@ def room_table(rooms: list[Room]) -> RoomTable:
     return RoomTable(counts=longest, solids=solids, materials=materials, lights=lights)
 
 
-def _first_hits(table: RoomTable, origins: Float[Tensor, "b v q 3"], directions: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _first_hits(table: RoomTable, origins: Float[Tensor, "b v q 3"], directions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Distance and table row ([b, v, r] both) of the first surfaces. ``q`` is 1 (a shared origin) or ``r``; directions come by axis."""
     distances, first = [], 0
     for count, entries in zip(table.counts, (_box_entries, _cylinder_entries, _sphere_entries), strict=True):
@@ -71,7 +72,7 @@ def _first_hits(table: RoomTable, origins: Float[Tensor, "b v q 3"], directions:
     return torch.cat(distances, dim=2).min(dim=2)
 
 
-def _local_rays(solids: Float[Tensor, "b p 9"], origins: Tensor, directions: tuple[Tensor, ...]) -> tuple[list[Tensor], ...]:
+def _local_rays(solids: Float[Tensor, "b p 9"], origins: Tensor, directions: Sequence[Tensor]) -> tuple[list[Tensor], ...]:
     """Origins [b, v, p, q], directions [b, v, p or 1, r] and half sizes [b, 1, p, 1] by axis, in the axes of every solid."""
     cx, cy, cz, hx, hy, hz, cosine, sine, _ = rearrange(solids, "b p c -> c b 1 p 1").unbind(0)
     x, y, z = (origins[..., axis].unsqueeze(2) - center for axis, center in enumerate((cx, cy, cz)))
@@ -128,8 +129,8 @@ class Surface:
 
     row: Tensor
     distance: Tensor
-    points: tuple[Tensor, Tensor, Tensor]
-    normals: tuple[Tensor, Tensor, Tensor]
+    points: tuple[Tensor, ...]
+    normals: tuple[Tensor, ...]
     """World, towards the origin."""
     material: Tensor
     """Row in the material table."""

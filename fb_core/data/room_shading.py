@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,7 +33,7 @@ def surface_colours(table: RoomTable, surface: Surface, footprint: Tensor) -> Fl
     return torch.stack(colours).clamp_(0, 1)
 
 
-def _light(table: RoomTable, points: tuple, normals: tuple) -> Float[Tensor, "b v r"]:
+def _light(table: RoomTable, points: Sequence[Tensor], normals: Sequence[Tensor]) -> Float[Tensor, "b v r"]:
     """Ambient light plus a soft lamp, darkened towards the room's edges and corners as inter-reflection does."""
     lamp = table.lights[:, None, None]
     tx, ty, tz = (lamp[..., axis] - points[axis] for axis in range(3))

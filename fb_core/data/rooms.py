@@ -10,7 +10,7 @@ import dataclasses
 import math
 import zlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -146,8 +146,9 @@ class Room:
     def mesh(self) -> trimesh.Trimesh:
         """The room's surfaces as one coloured triangle mesh (shell turned inside out); round solids are finely faceted."""
         import trimesh
+        from trimesh.visual import ColorVisuals
 
-        parts = []
+        parts: list[trimesh.Trimesh] = []
         for index, (kind, center, half, heading) in enumerate(
             zip(self.kinds.tolist(), self.centers.double().cpu(), self.halves.double().cpu(), self.headings.tolist(), strict=True)
         ):
@@ -160,11 +161,11 @@ class Room:
             part.apply_transform(trimesh.transformations.rotation_matrix(heading, [0, 0, 1]))
             part.apply_translation(center.numpy())
             colours = self.base[index + 5].expand(len(part.faces), 3) if index else self.base[self._shell_faces(part.face_normals)]
-            part.visual.face_colors = (colours.cpu().clamp(0, 1) * 255).round().byte().numpy()
+            part.visual = ColorVisuals(part, face_colors=(colours.cpu().clamp(0, 1) * 255).round().byte().numpy())
             if index == 0:
                 part.invert()
             parts.append(part)
-        return trimesh.util.concatenate(parts)
+        return cast("trimesh.Trimesh", trimesh.util.concatenate(parts))
 
     @staticmethod
     def _shell_faces(outward: np.ndarray) -> Tensor:
@@ -285,9 +286,9 @@ def _furnish(rng: np.random.Generator, family: RoomFamily, size: tuple, joiner: 
 def _footprint(piece: list[Solid]) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lower and upper corner on the floor of a piece whose headings are multiples of 90 degrees."""
     spans = [solid.half[:2] if round(solid.heading / (math.pi / 2)) % 2 == 0 else solid.half[1::-1] for solid in piece]
-    low = tuple(min(solid.center[axis] - span[axis] for solid, span in zip(piece, spans, strict=True)) for axis in (0, 1))
-    high = tuple(max(solid.center[axis] + span[axis] for solid, span in zip(piece, spans, strict=True)) for axis in (0, 1))
-    return low, high
+    low = [min(solid.center[axis] - span[axis] for solid, span in zip(piece, spans, strict=True)) for axis in (0, 1)]
+    high = [max(solid.center[axis] + span[axis] for solid, span in zip(piece, spans, strict=True)) for axis in (0, 1)]
+    return (low[0], low[1]), (high[0], high[1])
 
 
 def _dress_walls(rng: np.random.Generator, family: RoomFamily, size: tuple, joiner: Joiner) -> list[Solid]:
