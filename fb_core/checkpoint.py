@@ -179,7 +179,8 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
             raise ValueError(f"{path}: expected section {name!r} to be an object, got {content[name]!r}.")
         require_names(f"{path}, section {name!r}", (f.name for f in dataclasses.fields(kind)), content[name])
         try:
-            sections[name] = kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()})
+            choices: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()}
+            sections[name] = kind(**choices)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, section {name!r}: {error}") from error
     try:

@@ -97,10 +97,10 @@ def test_a_given_generator_samples_the_posterior():
     picture = torch.rand(1, 3, 16, 16)
     mean, logvar = vae.posterior(picture)
     torch.testing.assert_close(vae.encode(picture), 0.18215 * mean)
-    samples = vae.encode(picture.expand(4000, -1, -1, -1), torch.Generator().manual_seed(3)) / 0.18215
+    samples = vae.encode(picture.expand(1000, -1, -1, -1), torch.Generator().manual_seed(3)) / 0.18215
     std = (0.5 * logvar).exp()
-    assert ((samples.mean(0, keepdim=True) - mean).abs() < 5 * std / 4000**0.5).all()
-    assert ((samples.std(0, keepdim=True) / std - 1).abs() < 0.08).all()
+    assert ((samples.mean(0, keepdim=True) - mean).abs() < 5 * std / 1000**0.5).all()
+    assert ((samples.std(0, keepdim=True) / std - 1).abs() < 0.15).all()
     once, again = (vae.encode(picture, torch.Generator().manual_seed(5)) for _ in range(2))
     assert torch.equal(once, again)
 

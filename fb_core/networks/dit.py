@@ -5,8 +5,9 @@ that whatever is constant during sampling can be computed once. Parameter names 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -119,7 +120,7 @@ class DiT(nn.Module):
         self.pos_embed = PatchEmbedding(config)
         self.time_embed = TimeEmbedding(config.width)
         self.transformer_blocks = nn.ModuleList(
-            Block(config.width, config.heads, config.mlp_ratio * config.width, config.text_width) for _ in range(config.depth)
+            Block(config.width, config.heads, config.mlp_ratio * config.width, config.text_width or 0) for _ in range(config.depth)
         )
         self.proj_out_1 = nn.Linear(config.width, 2 * config.width)
         self.proj_out_2 = nn.Linear(config.width, config.patch**2 * config.out_channels)
@@ -128,6 +129,11 @@ class DiT(nn.Module):
     def dtype(self) -> torch.dtype:
         """Precision of the parameters."""
         return self.proj_out_2.weight.dtype
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The blocks in the order of their use."""
+        return cast(list[Block], list(self.transformer_blocks))
 
     def forward(
         self,
@@ -192,13 +198,13 @@ class DiT(nn.Module):
         """Scales and shifts of all norms at `time` in [0, 1]."""
         activated = self.time_embed.timestep_embedder(time)
         activated = F.silu(activated.to(at_least_float32(activated.dtype)))
-        blocks = [torch.stack([norm.scale_shift(activated) for norm in block.norms]) for block in self.transformer_blocks]
+        blocks = [torch.stack([norm.scale_shift(activated) for norm in block.norms]) for block in self.blocks]
         final = self.proj_out_1(activated.to(self.dtype))
         # The released layer holds the shift first here, unlike in the blocks.
         shift, scale = final.to(at_least_float32(final.dtype)).chunk(2, dim=-1)
         return Modulation(torch.stack(blocks), torch.stack([scale, shift]))
 
-    def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[KeysValues] | list[None]:
+    def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[KeysValues | None]:
         """Keys and values of every block's cross-attention; Nones for a network without text."""
         expected = self.config.text_width
         if not expected:
@@ -208,13 +214,13 @@ class DiT(nn.Module):
         if text is None or text.shape[-1] != expected:
             got = "None" if text is None else f"width {text.shape[-1]}"
             raise ValueError(f"text: expected an embedding of width {expected} (that of the empty prompt for no text), got {got}.")
-        return [block.attn2.keys_values(text.to(self.dtype)) for block in self.transformer_blocks]
+        return [block.attn2.keys_values(text.to(self.dtype)) for block in self.blocks]
 
     def run_blocks(
-        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: list[KeysValues] | list[None]
+        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: Sequence[KeysValues | None]
     ) -> Float[Tensor, "b tokens out"]:
         """Patches of velocity of tokens that carry their positions."""
-        for block, block_modulation, context in zip(self.transformer_blocks, modulation.blocks, contexts, strict=True):
+        for block, block_modulation, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
             tokens = block(tokens, block_modulation, context)
         tokens = F.layer_norm(tokens, tokens.shape[-1:], eps=FINAL_EPS)
         return self.proj_out_2(modulated(tokens, modulation.final).to(self.dtype))

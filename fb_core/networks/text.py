@@ -26,7 +26,7 @@ class TextEncoder:
         Raises ValueError if the package transformers, the folder or its contents are absent.
         """
         try:
-            from transformers import CLIPTextModel, CLIPTokenizer
+            from transformers import CLIPTextModel, CLIPTokenizer  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ValueError("text: prompts need the package transformers, which `pip install 'fillerbuster[text]'` installs.") from error
         if not Path(folder).is_dir():

@@ -274,5 +274,6 @@ class VAE(nn.Module):
                 closes_branch = name.endswith(("conv2", "to_out.0"))
                 std = 0.0 if closes_branch else module.weight[0].numel() ** -0.5
                 module.weight.copy_(torch.randn(module.weight.shape, generator=generator, device=generator.device) * std)
-                module.bias.zero_()
+                if module.bias is not None:
+                    module.bias.zero_()
         return self

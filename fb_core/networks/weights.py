@@ -1,9 +1,12 @@
 """Strict weights: a network takes a set of tensors exactly as named and shaped, or says which one does not fit."""
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def require_names(where: str, expected: Iterable[str], got: Iterable[str]) -> None:
@@ -27,7 +30,7 @@ def require_shapes(where: str, module: nn.Module, shapes: Mapping[str, tuple[int
             raise ValueError(f"{where}: expected {name} of shape {list(shape)}, got {list(shapes[name])}.")
 
 
-def without_weights(build: Callable[[], nn.Module]) -> nn.Module:
+def without_weights(build: Callable[[], Network]) -> Network:
     """The module that `build` makes, in evaluation mode and with parameters that occupy no memory until `adopt` gives them some."""
     with torch.device("meta"):
         return build().eval()
