@@ -49,7 +49,7 @@ def neighbour_distance(points: Float[Tensor, "m 3"], among: Float[Tensor, "k 3"]
 
     Without any neighbour: 0.1 scene units.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(points) == 0:
         return points.new_zeros(0)
@@ -57,7 +57,7 @@ def neighbour_distance(points: Float[Tensor, "m 3"], among: Float[Tensor, "k 3"]
     count = min(_NEIGHBOURS, len(everything) - 1)
     if count == 0:
         return points.new_full((1,), _LONELY_DISTANCE)
-    tree = cKDTree(everything.detach().cpu().double().numpy())
+    tree = KDTree(everything.detach().cpu().double().numpy())
     distances, _ = tree.query(points.detach().cpu().double().numpy(), k=count + 1)
     return torch.from_numpy(distances[:, 1:].mean(axis=1)).to(points)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,7 +23,7 @@ class LazyLpips:
     """
 
     def __init__(self) -> None:
-        self._metric: torch.nn.Module | None = None
+        self._metric: Any = None
         self._unavailable = False
 
     def __call__(self, first: Float[Tensor, "h w 3"], second: Float[Tensor, "h w 3"]) -> float | None:

@@ -187,8 +187,9 @@ class FillerbusterSplatModel(SplatfactoModel):
             self.info = info  # of training renders only: the strategy reads it after the backward pass
             self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, self.step, info)
         rgb = (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)
-        if self.config.use_bilateral_grid and self.training and "cam_idx" in (camera.metadata or {}):
-            rgb = self._apply_bilateral_grid(rgb[None], camera.metadata["cam_idx"], pinhole.height, pinhole.width)[0]
+        index = (camera.metadata or {}).get("cam_idx")  # generated views have none
+        if self.config.use_bilateral_grid and self.training and index is not None:
+            rgb = self._apply_bilateral_grid(rgb[None], index, pinhole.height, pinhole.width)[0]
         outputs = {"rgb": rgb, "accumulation": alpha, "background": background if self.training else background.expand_as(rgb)}
         if with_depth:
             depth = render[..., -1:]

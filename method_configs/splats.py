@@ -90,7 +90,8 @@ def without_completion(config: TrainerConfig, method_name: str) -> TrainerConfig
     """A copy under another name whose datamanager generates nothing; everything else is equal."""
     other = copy.deepcopy(config)
     other.method_name = method_name
-    other.pipeline.datamanager.completion = dataclasses.replace(other.pipeline.datamanager.completion, enabled=False)
+    datamanager: Any = other.pipeline.datamanager
+    datamanager.completion = dataclasses.replace(datamanager.completion, enabled=False)
     return other
 
 

@@ -141,6 +141,21 @@ def test_camera_optimizer_moves_only_indexed_views() -> None:
     assert pose.grad[2].abs().sum() > 0 and pose.grad[[0, 1, 3]].abs().sum() == 0
 
 
+def test_bilateral_grid_of_indexed_views() -> None:
+    model = make_model(use_bilateral_grid=True, grid_shape=(4, 4, 2)).train()
+    optimizers = make_optimizers(model)
+    model.step_cb(optimizers, 1)
+    for metadata, learns in (({"cam_idx": 1}, True), (None, False)):
+        view = camera()
+        view.metadata = metadata
+        optimizers.zero_grad_all()
+        losses = model.get_loss_dict(model(view), make_batch())
+        losses["main_loss"].backward()
+        gradient = model.bil_grids.grids.grad
+        assert (gradient is not None and gradient[1].abs().sum() > 0) == learns
+        assert losses["tv_loss"].isfinite()
+
+
 # ------------------------------------------------------------------------------------------------------------- outputs
 
 
