@@ -19,7 +19,8 @@ def psnr(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> F
 
 
 def ssim(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
-    """Mean structural similarity of each view, for values in [0, 1]: Gaussian window of 11 pixels and sigma 1.5 (Wang et al. 2004).
+    """Mean structural similarity of each view, for values in [0, 1]: Gaussian window of 11 pixels and sigma 1.5, valid windows only
+    (Wang et al. 2004).
 
     Raises ValueError for views with a side below 11 pixels, where no window fits.
     """
@@ -30,9 +31,11 @@ def ssim(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> F
         raise ValueError(
             f"ssim: expected views of at least {_SSIM_WINDOW} x {_SSIM_WINDOW} pixels, got {images.shape[3]} x {images.shape[2]}"
         )
-    similarity = structural_similarity_index_measure(images, truth, data_range=1.0, kernel_size=_SSIM_WINDOW, sigma=1.5, reduction="none")
-    assert isinstance(similarity, Tensor)
-    return similarity.reshape(len(images))
+    _, similarity = structural_similarity_index_measure(
+        images, truth, data_range=1.0, kernel_size=_SSIM_WINDOW, sigma=1.5, reduction="none", return_full_image=True
+    )
+    edge = _SSIM_WINDOW // 2  # torchmetrics also counts windows that hang over the border, the definition does not
+    return similarity[..., edge:-edge, edge:-edge].mean(dim=(1, 2, 3))
 
 
 def hole_share(accumulation: Float[Tensor, "n h w"]) -> Float[Tensor, " n"]:

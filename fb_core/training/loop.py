@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,7 @@ OnProgress = Callable[[int, int, dict[str, float]], None]
 """(steps done, steps in all, latest smoothed losses)."""
 
 
+@runtime_checkable
 class Stage(Protocol):
     """One thing that is trained: a network and the loss of a step."""
 
