@@ -96,8 +96,13 @@ class RoomPool:
         seed: int,
         device: torch.device | str = "cpu",
         encode: Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n 16 lh lw"]] | None = None,
+        with_images: bool = True,
     ):
-        """With ``encode`` (the frozen image autoencoder) the latents of every view are kept, so that they are made once."""
+        """With ``encode`` (the frozen image autoencoder) the latents of every view are kept, so that they are made once.
+
+        Without images (black ones stand in) nothing is rendered: enough for the raymap autoencoder.
+        """
+        self._with_images = with_images
         self.config, self.seed, self.device, self._encode = config, seed, torch.device(device), encode
         self._latents: list[Tensor | None] = [None] * config.rooms
         shape = (config.rooms, config.views, 3, config.image_size, config.image_size)
@@ -123,11 +128,13 @@ class RoomPool:
             generator = torch.Generator().manual_seed(self.seed * 7_000_003 + number)
             cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))
             rooms.append(room.to(self.device))
+            self._cameras[number % config.rooms], self._ids[number % config.rooms] = cameras[-1], number
+        if not self._with_images:
+            return
         rendered = render_batch(rooms, [group.to(self.device) for group in cameras], supersample=config.supersample)
-        for number, group, images in zip(numbers, cameras, rendered, strict=True):
+        for number, images in zip(numbers, rendered, strict=True):
             slot = number % config.rooms
             self._images[slot] = (images.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-            self._cameras[slot], self._ids[slot] = group, number
             if self._encode is not None:
                 self._latents[slot] = self._encode(self._images[slot].float() / 255)
 

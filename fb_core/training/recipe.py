@@ -18,6 +18,7 @@ from fb_core.data.sequences import PoolConfig, RoomPool
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.training.dit_stage import DiTLossConfig, DiTStage
+from fb_core.training.linear_start import start_linear
 from fb_core.training.loop import LoopConfig, OnProgress, Run
 from fb_core.training.vae_stage import VAELossConfig, VAEStage, reconstruction_error
 
@@ -84,8 +85,11 @@ def run_stage(
         loss = recipe.image_vae_loss if stage == "image-vae" else recipe.raymap_vae_loss
         with torch.random.fork_rng():
             torch.manual_seed(recipe.seed)
-            network = VAE(config).to(device)
-        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device)
+            network = VAE(config)
+        if config.norm == "none":
+            start_linear(network, torch.Generator().manual_seed(recipe.seed))
+        network.to(device)
+        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, with_images=stage == "image-vae")
         task = VAEStage(network, pool, kind=stage, config=loss, seed=recipe.seed)
         loop = recipe.image_vae_loop if stage == "image-vae" else recipe.raymap_vae_loop
     run = Run(task, loop if steps is None else dataclasses.replace(loop, steps=steps), folder / stage)
