@@ -38,9 +38,10 @@ PAIRS_PER_BLOCK = 2**18
 ROWS_PER_LIST = 2**20
 _NEVER = -1e4
 _TERMS, _COLUMNS = 6, 11
-# Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels. Deeper where there are fewer cells.
-_SHALLOWEST, _DEEPEST, _DEEPEST_THIN = 16, 64, 1024
-_THIN = 128
+# Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels, deeper where there are fewer cells.
+_SHALLOWEST = 16
+# A layer (one rank) with fewer values than this is scanned by torch; larger layers are walked one by one, which is faster.
+_THIN = 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,8 +169,7 @@ class _Stretch:
         while rank < deepest:
             while lengths[width - 1] <= rank:  # long lists come first, so finished cells are at the end
                 width -= 1
-            most = _DEEPEST if width * pixels >= _THIN else _DEEPEST_THIN
-            depth = min(max(_SHALLOWEST, budget // (width * pixels)), most, deepest - rank)
+            depth = min(max(_SHALLOWEST, budget // (width * pixels)), deepest - rank)
             splats, padding = self._pick(listed, rank, depth, width, full=lengths[width - 1] >= rank + depth)
             block, after = _block(table, splats, padding, centers[..., :width], light[:width], depth, scratch)
             light[:width] = after[-1]
@@ -227,7 +227,7 @@ def _block(
 def _darken(alpha: Tensor, lights: Tensor) -> None:
     """lights[b + 1] = lights[b] (1 - alpha[b]), in place."""
     torch.sub(1.0, alpha, out=lights[1:])
-    if alpha[0].numel() < _THIN:  # one slow scan beats very many tiny calls
+    if alpha[0].numel() < _THIN:
         torch.cumprod(lights, dim=0, out=lights)
         return
     for before, after in pairwise(lights.unbind(0)):
@@ -242,7 +242,7 @@ def _stop(alpha: Tensor, after: Tensor) -> None:
 def _march(lists: CellLists, width: int) -> Iterator[_Stretch]:
     """All cells that have something to draw, in stretches of at most `width` cells, long lists first."""
     busy = torch.argsort(lists.counts, descending=True)[: int((lists.counts > 0).sum())]
-    for cells in busy.split(width):
+    for cells in busy.split(width) if busy.numel() else ():
         stretch = _Stretch(cells, lists.counts.index_select(0, cells), lists.starts.index_select(0, cells), 0)
         while stretch is not None:
             yield stretch
@@ -268,10 +268,7 @@ def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: 
     seen = torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
     share = weights.mul_(seen.permute(1, 0, 2))
     rest = scratch.take("rest", depth, width, pixels)
-    front = behind
-    for part, remaining in zip(share.unbind(0), rest.unbind(0), strict=True):
-        front = torch.sub(front, part, out=remaining)
-    behind.copy_(front)
+    _pass_by(behind, share, rest)
     # d loss / d exponent = alpha T (value . upstream) - alpha / (1 - alpha) * what lies behind
     ratio = torch.sub(1.0, block.alpha, out=scratch.take("seen", depth, width, pixels))
     g = share.addcmul_(torch.div(block.alpha, ratio, out=ratio), rest, value=-1.0)
@@ -284,6 +281,18 @@ def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: 
     else:
         new[:, _TERMS : _TERMS + 2] = 0.0
     sums.index_add_(0, block.splats.long(), new)  # several times faster with 64-bit indices
+
+
+def _pass_by(behind: Tensor, share: Tensor, rest: Tensor) -> None:
+    """rest[b] = behind - share[0] - .. - share[b]; then `behind` takes the last of these."""
+    if behind.numel() < _THIN:
+        torch.sub(behind, torch.cumsum(share, dim=0, out=rest), out=rest)
+        behind.copy_(rest[-1])
+        return
+    front = behind
+    for part, remaining in zip(share.unbind(0), rest.unbind(0), strict=True):
+        front = torch.sub(front, part, out=remaining)
+    behind.copy_(front)
 
 
 def _central_moments(d: Float[Tensor, "2 bs"], local: Float[Tensor, "6 bs"]) -> Float[Tensor, "6 bs"]:

@@ -190,7 +190,7 @@ class _Project(torch.autograd.Function):
                 leaving = footprint_gradient(of(means), shapes, viewmats[camera], lens, settings.eps2d, floor, incoming)
                 parts = (leaving.means, leaving.quats, leaving.scales, leaving.covars)
                 for total, part in zip(totals, parts, strict=False):
-                    if total is not None:
+                    if total is not None and part is not None:
                         total.index_add_(0, rows, part)
                 if totals[4] is not None:
                     totals[4][camera] = leaving.viewmat

@@ -92,6 +92,8 @@ def rasterization(
     )
     with single_thread():
         usable, dropped = _usable(means, quats, scales, opacities, covars)
+        if usable is not None:
+            opacities = opacities.masked_fill(~usable, 0.0)
         projection = project_splats(means, quats, scales, opacities, covars, viewmats, Ks, usable, settings)
         opacities = opacities.expand(viewmats.shape[0], -1)
         if settings.antialiased:
@@ -111,13 +113,13 @@ def _usable(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacitie
     """Which Gaussians have finite values only (None = all of them), and how many have not."""
     with torch.no_grad():
         given = [t for t in (means, quats, scales, covars) if t is not None]
-        total = sum((t.reshape(t.shape[0], -1).sum(dim=1) for t in given), opacities)
+        total = sum((t.flatten(1).sum(dim=1) for t in given), opacities)
         finite = total.isfinite()
         if bool(finite.all()):
             return None, 0
         finite = opacities.isfinite()
         for tensor in given:
-            finite = finite & tensor.reshape(tensor.shape[0], -1).isfinite().all(dim=1)
+            finite = finite & tensor.flatten(1).isfinite().all(dim=1)
         dropped = int((~finite).sum())
     if dropped:
         _say_once("Some Gaussians hold values that are not finite (NaN or infinite); they are left out of the picture and get no gradient.")
@@ -162,7 +164,8 @@ def _ellipses(projection: Projection, opacities: Tensor, chosen: Tensor, tile_si
         cameras, number = projection.depths.shape
 
         def columns(tensor: Tensor) -> tuple[Tensor, ...]:
-            return tensor.detach().reshape(cameras * number, -1).index_select(0, chosen).t().contiguous().unbind(0)
+            rows = tensor.detach().flatten(0, 1).index_select(0, chosen)
+            return (rows if rows.ndim == 2 else rows[:, None]).t().contiguous().unbind(0)
 
         x, y = columns(projection.means2d)
         A, B, C = columns(projection.conics)
@@ -245,7 +248,8 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgr
             raise ValueError(f"sh_degree should be 0 to {MAX_DEGREE} but is {sh_degree}.")
         if colors.shape[-1] != 3 or colors.shape[-2] < (sh_degree + 1) ** 2:
             raise ValueError(
-                f"colors should hold at least {(sh_degree + 1) ** 2} x 3 coefficients for sh_degree {sh_degree} but has shape {tuple(colors.shape)}."
+                f"colors should hold at least {(sh_degree + 1) ** 2} x 3 coefficients for sh_degree {sh_degree} "
+                f"but has shape {tuple(colors.shape)}."
             )
     if backgrounds is not None:
         _expect("backgrounds", backgrounds, (cameras, colors.shape[-1]), means)
