@@ -73,25 +73,21 @@ def encode_known(
 
 def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: tuple[int, int]) -> Conditioning:
     """The conditioning of "nothing is known", for classifier-free guidance: one black image and one raymap of zeros, encoded once."""
-    black = next(image_vae.parameters()).new_zeros(1, 3, *pixels)
-    no_rays = next(raymap_vae.parameters()).new_zeros(1, 6, *pixels)
-    image_latent = image_vae.encode(black).to(like.channels.dtype)
-    ray_latent = raymap_vae.encode(no_rays).to(like.channels.dtype)
+    image_latent = image_vae.encode(like.channels.new_zeros(1, 3, *pixels))
+    ray_latent = raymap_vae.encode(like.channels.new_zeros(1, 6, *pixels))
     masks = like.channels.new_zeros(1, 2, *like.channels.shape[-2:])
     null = torch.cat([image_latent, ray_latent, masks], dim=-3)
     return Conditioning(channels=null.expand(like.channels.shape))
 
 
 def encode_in_chunks(vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int) -> Float[Tensor, "n 16 lh lw"]:
-    """Latents of n views, a few at a time so that memory does not grow with n; in float32 for the sampler."""
-    dtype = next(vae.parameters()).dtype
-    return torch.cat([vae.encode(chunk.to(dtype)).float() for chunk in pixels.split(views_at_once)])
+    """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own precision."""
+    return torch.cat([vae.encode(chunk) for chunk in pixels.split(views_at_once)])
 
 
 def decode_in_chunks(vae: VAE, latents: Float[Tensor, "n 16 lh lw"], views_at_once: int = 16) -> Float[Tensor, "n c h w"]:
-    """Pixels in [0, 1] of n views, a few at a time, in float32."""
-    dtype = next(vae.parameters()).dtype
-    return torch.cat([vae.decode(chunk.to(dtype), clamp=True).float() for chunk in latents.split(views_at_once)])
+    """Pixels in [0, 1] of n views, a few at a time."""
+    return torch.cat([vae.decode(chunk, clamp=True) for chunk in latents.split(views_at_once)])
 
 
 def join(state: Float[Tensor, "*b 32 h w"], conditioning: Conditioning) -> Float[Tensor, "*b 66 h w"]:

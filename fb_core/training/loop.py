@@ -136,7 +136,7 @@ class Run:
         loss = losses["loss"]
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(
-                f"{self.stage.name}: the loss became {float(loss)} at step {self.step}; the last good state is {self.folder / 'checkpoint.pt'}"
+                f"{self.stage.name}: the loss became {float(loss.detach())} at step {self.step}; the last good state is {self.folder / 'checkpoint.pt'}"
             )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -192,6 +192,8 @@ class Run:
             log.write_text("".join(line + "\n" for line in kept))
 
     def _draw_curve(self) -> None:
+        if not self.step:
+            return
         import matplotlib
 
         matplotlib.use("Agg")
