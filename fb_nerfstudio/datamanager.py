@@ -31,9 +31,11 @@ from fb_core.geometry.shell import Shell
 from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
 from fb_nerfstudio.completed_views import CompletedViews
-from fb_nerfstudio.completion import CapturedView, CompletionConfig, Inpainter, PlannedRound, announcement, plan_completion, run_completion
+from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
+from fb_nerfstudio.completion_config import CompletionConfig
+from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
 from fb_nerfstudio.dataparser import without_open3d
-from fb_nerfstudio.unseen import TRAINED_STEPS, find_unseen, render_geometry, surface_points, unseen_gaussians, with_unseen_masks
+from fb_nerfstudio.unseen import TRAINED_STEPS, coarse, find_unseen, render_geometry, surface_points, unseen_gaussians, with_unseen_masks
 from fb_nerfstudio.viewer import CompletionPanel
 
 COMPLETION_FOLDER = "completion"
@@ -173,7 +175,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         points = self._seen_points(splats, cameras, step)
         plan = plan_completion(cameras, points, config, size=config.image_size or model.size)
         if plan.rounds:
-            CONSOLE.print(announcement(plan, config, model))
+            CONSOLE.print(announcement(plan, config, model, done=self._bank))
             context = [self._captured_view(index, cameras[index]) for index in plan.context]
             left = len(plan.rounds) - (0 if self._bank is None else len(self._bank.rounds))
             with _Bars(self.completion_panel, len(plan.rounds)) as bars:
@@ -230,7 +232,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         seeds = config.seed_gaussians and hasattr(splats, "add_gaussians")
         if not seeds and config.generated_pixels == "all":
             return 0
-        rendered = render_geometry(splats, self._bank.cameras) if step >= TRAINED_STEPS else None
+        rendered = render_geometry(splats, coarse(self._bank.cameras)) if step >= TRAINED_STEPS else None
         unseen = find_unseen(self._bank, cameras, shell, rendered)
         if config.generated_pixels == "unseen":
             self._set_bank(with_unseen_masks(self._bank, unseen))

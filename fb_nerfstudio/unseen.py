@@ -27,7 +27,7 @@ SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
 TRAINED_STEPS = 100
 """Steps after which the splats' own depth and accumulation are believed."""
-_DEPTH_SIDE = 64
+_SIDE = 64  # pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures
 _BORDER_SHARE = 1 / 32  # unseen regions grow by this part of the picture, so that old and new overlap at the seam
 
 
@@ -43,12 +43,18 @@ class Rendered:
 
 @dataclass(frozen=True, kw_only=True)
 class Unseen:
-    """The part of generated views that the capture has not seen."""
+    """The part of generated views that the capture has not seen, at the size of :func:`coarse`."""
 
     mask: Bool[Tensor, "n h w"]
     """True where unseen."""
     points: Float[Tensor, "n h w 3"]
     """World points of the pixels on the shell; infinite where a ray never meets it."""
+
+
+def coarse(cameras: Pinholes) -> Pinholes:
+    """The same cameras with small pictures, on the CPU."""
+    scale = min(1.0, _SIDE / max(cameras.width, cameras.height))
+    return cameras.to("cpu", torch.float32).scaled(max(1, round(cameras.width * scale)), max(1, round(cameras.height * scale)))
 
 
 @torch.no_grad()
@@ -70,8 +76,7 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
     """World points of what the splats show in the captured cameras (at most ``limit``, evenly spread over the pictures)."""
     groups = []
     for camera in cameras:
-        scale = min(1.0, _DEPTH_SIDE / max(camera.width, camera.height))
-        small = camera.to("cpu", torch.float32).scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        small = coarse(camera)
         rendered = render_geometry(model, small)
         solid = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
         groups.append(small.unproject(rendered.depth)[solid])
@@ -89,9 +94,9 @@ def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shel
         views: the generated views.
         captured: the capture's cameras.
         shell: the guessed surface, for depth.
-        rendered: the splats from the views' cameras, or None while they are untrained.
+        rendered: the splats from the views' cameras made coarse, or None while they are untrained.
     """
-    cameras = views.cameras.to("cpu", torch.float32)
+    cameras = coarse(views.cameras)
     directions = cameras.directions()
     origins = cameras.centers[:, None, None].expand_as(directions)
     distance = intersect(shell, origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
@@ -107,9 +112,10 @@ def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shel
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
     """The views with masks that leave only their unseen pixels and a narrow seam around them."""
-    reach = max(1, round(views.images.shape[1] * _BORDER_SHARE))
-    grown = F.max_pool2d(unseen.mask[:, None].float(), 2 * reach + 1, stride=1, padding=reach) > 0
-    return dataclasses.replace(views, masks=rearrange(grown, "n 1 h w -> n h w 1"))
+    reach = max(1, round(unseen.mask.shape[1] * _BORDER_SHARE))
+    grown = F.max_pool2d(unseen.mask[:, None].float(), 2 * reach + 1, stride=1, padding=reach)
+    masks = F.interpolate(grown, size=views.images.shape[1:3], mode="nearest") > 0
+    return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1"))
 
 
 def unseen_gaussians(
@@ -120,6 +126,7 @@ def unseen_gaussians(
     All views share the shell, so what they agree on lands in one place.
     """
     usable = unseen.mask & torch.isfinite(unseen.points).all(dim=-1)
-    points, colors = unseen.points[usable], views.images[usable].float() / 255
-    chosen = torch.randperm(len(points), generator=generator)[:limit]
-    return points[chosen], colors[chosen]
+    images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
+    colors = rearrange(F.interpolate(images, size=usable.shape[1:], mode="area"), "n c h w -> n h w c")
+    chosen = torch.randperm(int(usable.sum()), generator=generator)[:limit]
+    return unseen.points[usable][chosen], colors[usable][chosen]

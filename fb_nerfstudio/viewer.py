@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from fb_nerfstudio.completed_views import CompletedViews
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 _NODE = "/completion"
 _COLORS = ((255, 160, 30), (70, 150, 255), (90, 210, 120), (210, 110, 230), (240, 220, 80))
 _LARGEST_PICTURE = 128  # pixels; what a frustum shows
+_FRUSTUM_SHARE = 0.35  # size of a frustum, in units of the usual distance between neighbouring cameras
 
 
 class CompletionPanel(ViewerControl):
@@ -75,11 +77,10 @@ class CompletionPanel(ViewerControl):
         title = "Anchors" if views.origins[0].role == "anchor" else f"Round {number}"
         scene, node = self.viser_server.scene, f"{_NODE}/{name}"
         group = scene.add_frame(node, show_axes=False)  # hiding it hides all below it
-        color = _COLORS[number % len(_COLORS)]
-        self._groups[name] = [group, *(self._draw_view(f"{node}/view_{i:03d}", views, i, color) for i in range(len(views)))]
+        self._groups[name] = [group, *(self._draw_view(f"{node}/view_{index:03d}", views, index) for index in range(len(views)))]
         self._add_switch(name, f"{title} ({len(views)})", lambda visible: setattr(group, "visible", visible))
 
-    def _draw_view(self, node: str, views: CompletedViews, index: int, color: tuple[int, int, int]) -> Any:
+    def _draw_view(self, node: str, views: CompletedViews, index: int) -> Any:
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
         from viser import transforms
 
@@ -89,8 +90,8 @@ class CompletionPanel(ViewerControl):
             node,
             fov=float(2 * np.arctan(camera.height / 2 / float(camera.focal[0, 1]))),
             aspect=camera.width / camera.height,
-            scale=self.viewer.config.camera_frustum_scale,
-            color=color,
+            scale=max(self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(views) * VISER_NERFSTUDIO_SCALE_RATIO),
+            color=_COLORS[views.origins[index].round % len(_COLORS)],
             image=views.images[index, ::stride, ::stride].cpu().numpy(),
             wxyz=transforms.SO3.from_matrix(camera.rotations[0].double().numpy()).wxyz,  # frustums have OpenCV axes, as ours
             position=camera.centers[0].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
@@ -123,3 +124,11 @@ class CompletionPanel(ViewerControl):
         count = 0 if self.views is None else len(self.views)
         text = f"{count} generated views" if count else "No generated views"
         self._status.content = f"{text}  \n{self._message}" if self._message else text
+
+
+def spacing(views: CompletedViews) -> float:
+    """The median distance from a camera to its nearest neighbour, in scene units; 0 for a single camera."""
+    centers = views.cameras.centers.double().cpu()
+    if len(centers) < 2:
+        return 0.0
+    return float((torch.cdist(centers, centers) + torch.diag(torch.full((len(centers),), torch.inf))).min(dim=1).values.median())

@@ -15,14 +15,9 @@ from fb_core.geometry.raymap import raymaps_of
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import CompletedViews
-from fb_nerfstudio.completion import (
-    CapturedView,
-    CompletionConfig,
-    announcement,
-    fitted_view,
-    plan_completion,
-    run_completion,
-)
+from fb_nerfstudio.completion import CapturedView, announcement, fitted_view, run_completion
+from fb_nerfstudio.completion_config import CompletionConfig
+from fb_nerfstudio.completion_plan import plan_completion
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

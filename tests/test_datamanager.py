@@ -22,7 +22,7 @@ from fb_core.geometry.shell import sphere
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import CompletedViews, Origin
-from fb_nerfstudio.completion import CompletionConfig
+from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
 from fb_nerfstudio.unseen import Rendered, find_unseen, unseen_gaussians, with_unseen_masks
 

@@ -1,0 +1,94 @@
+"""Options of completing a capture: what is generated, from where, and how it takes part in the training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from fb_core.inpainter import SamplingConfig
+
+
+@dataclass
+class PlacementConfig:
+    """Where the cameras of generated views may stand and look."""
+
+    radius: float = 1.0
+    """Radius of the anchors' cylinder, in units of the capture's own radius."""
+    inner_radius: float = 0.5
+    """Densified views fill the cylinder from this radius outwards (same unit)."""
+    height: float = 1.0
+    """Spread of the cameras' heights, in units of the capture's own."""
+    max_pitch_degrees: float = 45.0
+    """Steepest look up or down in captures that look outward (rooms)."""
+    target_spread: float = 0.7
+    """How far from the focus cameras look in captures that look inward (objects), in units of the capture's radius."""
+    clearance: float = 0.1
+    """Least distance from seen geometry, in units of its median distance from the scene's centre; 0 allows any."""
+
+
+@dataclass
+class CompletionConfig:
+    """What is generated, with which model, and how it takes part in the training."""
+
+    enabled: bool = True
+    """Complete the capture with generated views; without, this is plain Gaussian splatting."""
+    model: Path | None = None
+    """Folder of the diffusion model (config.json and safetensors); None is the small bundled model."""
+    at_step: int = 0
+    """Training step before which the views are generated. Later, the splats themselves show what is seen and how far it is."""
+    context_views: int = 16
+    """Captured views that the model is conditioned on; fewer when the capture has fewer."""
+    context_choice: Literal["spread", "stride"] = "spread"
+    """Take context views that differ most in place and direction, or every so many (the paper's choice)."""
+    anchor_views: int = 24
+    """Views generated together in the first round."""
+    densify_rounds: int = 3
+    """Rounds after the anchors, each conditioned on the context and the anchors."""
+    densify_views: int = 24
+    """Views generated together in each of these rounds."""
+    image_size: int | None = None
+    """Side of the square views in pixels; None is the size the model was trained at."""
+    steps: int = 24
+    """Denoising steps per round."""
+    guidance_unknown: float = 7.0
+    """Guidance scale in unknown pixels."""
+    guidance_known: float = 1.1
+    """Guidance scale in known pixels."""
+    seed: int = 0
+    """Decides cameras, images, and which training steps draw generated views."""
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    """Where the new cameras stand and look."""
+    generated_share: float = 0.5
+    """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn equally often."""
+    generated_pixels: Literal["all", "unseen"] = "all"
+    """Train on whole generated views, or only on their pixels that the capture has not seen."""
+    view_weight: float = 1.0
+    """Weight of a generated view's loss; captured views have 1."""
+    seed_gaussians: bool = True
+    """Add Gaussians for generated pixels where the capture has seen nothing."""
+    max_seed_gaussians: int = 20000
+    """At most this many of them."""
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("at_step", 0),
+            ("context_views", 1),
+            ("anchor_views", 0),
+            ("densify_rounds", 0),
+            ("densify_views", 0),
+            ("steps", 2),
+        ):
+            if getattr(self, name) < least:
+                raise ValueError(f"completion.{name}: expected at least {least}, got {getattr(self, name)}")
+        if self.image_size is not None and self.image_size < 16:
+            raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
+        if not 0.0 <= self.generated_share <= 1.0:
+            raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
+        if self.view_weight < 0:
+            raise ValueError(f"completion.view_weight: expected 0 or more, got {self.view_weight}")
+
+    @property
+    def sampling(self) -> SamplingConfig:
+        """The sampler's part of these options."""
+        return SamplingConfig(steps=self.steps, guidance_unknown=self.guidance_unknown, guidance_known=self.guidance_known)

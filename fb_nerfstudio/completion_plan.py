@@ -1,0 +1,189 @@
+"""The plan of a completion (paper, section 3.2): which captured views condition it, and where the new cameras stand and look.
+
+A few anchors on a cylinder around the scene come first; rounds of densified views fill the space between. Nothing here
+knows nerfstudio.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.paths import (
+    CaptureShape,
+    cylinder_centers,
+    inward_targets,
+    kept_clear,
+    outward_directions,
+    seen_by,
+    sphere_directions,
+    spread_subset,
+    strided_subset,
+)
+from fb_core.geometry.shell import Shell, fit_shell
+from fb_nerfstudio.completed_views import ANCHOR, DENSIFY
+from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
+
+_ANCHOR_LEVELS, _DENSIFY_LEVELS = 2, 3
+_SEEN_NEED = 0.2  # looking at what the capture has seen is worth this much of looking at what it has not
+_PLANNING_POINTS = 4000
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedRound:
+    """Views that will be generated together."""
+
+    number: int
+    """Counted from 0, the anchors."""
+    role: str
+    """``anchor`` or ``densify``."""
+    seed: int
+    """Decides the images."""
+    cameras: Pinholes
+    """The new views' cameras."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionPlan:
+    """All that is decided before the model runs."""
+
+    shape: CaptureShape
+    """Centre, up, radius and kind of the capture."""
+    shell: Shell
+    """Guess of the surface all around."""
+    captured: int
+    """Views the capture has."""
+    context: tuple[int, ...]
+    """Indices of the captured views that condition every round; the most level first."""
+    rounds: tuple[PlannedRound, ...]
+    """Anchors first."""
+    size: int
+    """Side of all views in pixels while they are generated."""
+
+    @property
+    def new_views(self) -> int:
+        """How many views will be generated."""
+        return sum(len(one.cameras) for one in self.rounds)
+
+
+def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None, config: CompletionConfig, *, size: int) -> CompletionPlan:
+    """Choose context views and new cameras.
+
+    Anchors stand on a cylinder of the capture's own centre, up and radius. In captures that look outward (rooms) each looks
+    where the capture and the views before it looked least; in captures that look inward (objects) each looks at a random
+    point around the focus. No camera is placed outside the guessed surface or nearer to a seen point than the clearance.
+
+    Args:
+        cameras: the captured cameras, one per entry (sizes may differ).
+        points: seen surface points in the same world, or None when there are none yet.
+        config: numbers of views, placement, seed.
+        size: side of the generated views in pixels.
+    """
+    cameras = [camera.to("cpu", torch.float32) for camera in cameras]
+    shape = CaptureShape.of(cameras)
+    points = _thinned(points, shape)
+    site = _Site(shape=shape, shell=_shell_of(shape, points), points=points, cameras=cameras, placement=config.placement)
+    count = config.context_views
+    context = spread_subset(cameras, count) if config.context_choice == "spread" else strided_subset(len(cameras), count)
+    # The new views have the scale of the fitted context views: one lens for the whole sequence, as in training.
+    focal = float(torch.stack([cameras[i].focal.mean() * size / max(cameras[i].width, cameras[i].height) for i in context]).median())
+    half_angle = math.atan(size / 2 / focal)
+    need = site.need()
+    generator = torch.Generator().manual_seed(_round_seed(config.seed, -1))
+    rounds = []
+    for number, views in enumerate([config.anchor_views] + [config.densify_views] * config.densify_rounds):
+        if views == 0:
+            continue
+        role = ANCHOR if number == 0 else DENSIFY
+        centers = site.centers(role, views, generator)
+        targets, need = site.targets(centers, need, half_angle, generator)
+        new = Pinholes.looking_at(centers, targets, up=shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size)
+        rounds.append(PlannedRound(number=number, role=role, seed=_round_seed(config.seed, number), cameras=new))
+    return CompletionPlan(shape=shape, shell=site.shell, captured=len(cameras), context=tuple(context), rounds=tuple(rounds), size=size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Site:
+    """The scene as far as placing cameras needs it."""
+
+    shape: CaptureShape
+    shell: Shell
+    points: Float[Tensor, "m 3"]
+    cameras: list[Pinholes]
+    placement: PlacementConfig
+
+    def surface(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
+        """Points all over the shell, and their directions from its centre."""
+        directions = sphere_directions(1024, like=self.shape.center)
+        return self.shape.center + directions * self.shell.radius(directions)[:, None], directions
+
+    def need(self) -> Float[Tensor, "k"]:
+        """How much each surface point deserves to be seen: little where the capture saw it, and less far from level.
+
+        People look ahead more than at floor and ceiling, and so did the cameras that the model was trained on.
+        """
+        surface, directions = self.surface()
+        return (1.0 - 0.6 * (directions @ self.shape.up) ** 2) * torch.where(seen_by(self.cameras, surface), _SEEN_NEED, 1.0)
+
+    def centers(self, role: str, views: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+        """Camera centres of one round, pulled out of seen geometry."""
+        shape, placement = self.shape, self.placement
+        typical = float(self.shell.log_radius.median().exp())
+        radius = placement.radius * max(shape.radius, 0.05 * typical)  # a pure rotation gets a little parallax
+        half_height = placement.height * (shape.half_height if shape.outward else max(shape.half_height, 0.125 * shape.radius))
+        centers = cylinder_centers(
+            shape,
+            views,
+            generator=generator,
+            radius=radius,
+            inner_radius=radius if role == ANCHOR else placement.inner_radius * radius,
+            half_height=half_height,
+            levels=_ANCHOR_LEVELS if role == ANCHOR else _DENSIFY_LEVELS,
+        )
+        if placement.clearance == 0:
+            return centers
+        refuges = torch.cat([camera.centers for camera in self.cameras])
+        return kept_clear(centers, shell=self.shell, points=self.points, clearance=placement.clearance * typical, refuges=refuges)
+
+    def targets(
+        self, centers: Float[Tensor, "n 3"], need: Float[Tensor, "k"], half_angle_radians: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "k"]]:
+        """A point for each camera to look at, and the need that remains."""
+        if not self.shape.outward:
+            return inward_targets(centers, shape=self.shape, spread=self.placement.target_spread, generator=generator), need
+        looks, need = outward_directions(
+            centers,
+            surface=self.surface()[0],
+            need=need,
+            up=self.shape.up,
+            half_angle_radians=half_angle_radians,
+            max_pitch_degrees=self.placement.max_pitch_degrees,
+            generator=generator,
+        )
+        return centers + looks * max(self.shape.radius, 1.0), need
+
+
+def _thinned(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, "m 3"]:
+    """At most a few thousand finite points on the CPU."""
+    if points is None:
+        return shape.center.new_empty(0, 3)
+    points = points.detach().cpu().to(shape.center)
+    points = points[torch.isfinite(points).all(dim=1)]
+    return points[torch.linspace(0, len(points) - 1, min(len(points), _PLANNING_POINTS)).long()]
+
+
+def _shell_of(shape: CaptureShape, points: Tensor) -> Shell:
+    """The surface all around; without points, a sphere that leaves the cameras room."""
+    guess = (3.0 if shape.outward else 2.0) * shape.radius
+    return fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up)
+
+
+def _round_seed(seed: int, number: int) -> int:
+    """An independent seed for each round."""
+    return int(np.random.SeedSequence([seed % 2**63, number + 1]).generate_state(1, np.uint64)[0] >> np.uint64(1))
