@@ -84,7 +84,9 @@ class _Table:
     """What a block needs to know, one row for each chosen Gaussian (one gather fetches all of it)."""
 
     rows: Float[Tensor, "v r"]
-    """log2(opacity), two blanks, -A/2, -B, -C/2, x, y, A, B, C, the values, 1; conic entries times log2(e)."""
+    """log2(opacity), two blanks, -A/2, -B, -C/2, x, y, A, B, C, the values, 1; conic entries times log2(e); then padding."""
+    channels: int
+    """Values and the 1."""
     monomials: Float[Tensor, "6 p"]
     centers: Float[Tensor, "2 cells"]
     alpha_threshold: float
@@ -116,13 +118,22 @@ class _Scratch:
     def __init__(self, like: Tensor):
         self._like = like
         self._buffers: dict[str, Tensor] = {}
+        self._views: dict[tuple[str | int, ...], Tensor] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
-        size = math.prod(shape)
-        buffer = self._buffers.get(name)
-        if buffer is None or buffer.numel() < size:
-            buffer = self._buffers[name] = self._like.new_empty(size)
-        return buffer[:size].view(shape)
+        view = self._views.get((name, *shape))
+        if view is None:
+            size = math.prod(shape)
+            if name not in self._buffers or self._buffers[name].numel() < size:
+                self._buffers[name] = self._like.new_zeros(size)
+                self._views = {key: value for key, value in self._views.items() if key[0] != name}
+            view = self._views[(name, *shape)] = self._buffers[name][:size].view(shape)
+        return view
+
+
+def _padded(width: int) -> int:
+    """Row length for gathers and sums of rows: torch handles whole vectors twice as fast."""
+    return -(-width // 16) * 16
 
 
 def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
@@ -134,18 +145,20 @@ def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
 
 def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _Table:
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
-    rows = values.new_empty(values.shape[0], _COLUMNS + values.shape[1] + 1)
+    used = _COLUMNS + values.shape[1] + 1
+    rows = values.new_empty(values.shape[0], _padded(used))
     A, B, C = (column * math.log2(math.e) for column in (ellipses.A, ellipses.B, ellipses.C))
     blank = torch.zeros_like(A)
     torch.stack(
         [ellipses.opacity.log2(), blank, blank, -0.5 * A, -B, -0.5 * C, ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :_COLUMNS]
     )
-    rows[:, _COLUMNS:-1] = values
-    rows[:, -1] = 1.0
+    rows[:, _COLUMNS : used - 1] = values
+    rows[:, used - 1 :] = 1.0
     # A little slack: the polynomial may round an exponent to slightly above log(opacity).
     may_cap = values.shape[0] > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
     return _Table(
         rows=rows,
+        channels=values.shape[1] + 1,
         monomials=_monomials(grid.size, values),
         centers=torch.stack(grid.centers(values)),
         alpha_threshold=float(below),
@@ -220,7 +233,7 @@ def _block(
     lights = scratch.take("light", depth + 1, width, pixels)
     lights[0] = light
     _darken(alpha, lights)
-    values = rows[:, _COLUMNS:].view(depth, width, -1)
+    values = rows[:, _COLUMNS : _COLUMNS + table.channels].view(depth, width, -1)
     return _Block(splats=splats, columns=k, values=values, alpha=alpha, light=lights[:depth], capped=capped), lights[1:]
 
 
@@ -256,15 +269,16 @@ def _forward_block(block: _Block, image: Tensor, scratch: _Scratch) -> None:
 
 
 def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: _Scratch):
-    """Add the block's gradients to `sums` [v, 6 + 2 + d1]; `behind` [s, p], the part of the loss that lies behind, is advanced in place.
+    """Add the block's gradients to `sums` [v, r]; `behind` [s, p], the part of the loss that lies behind, is advanced in place.
 
-    The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls, then the values.
+    The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
     """
     depth, width, pixels = block.alpha.shape
     upstream, behind = upstream[:width], behind[:width]
     new = scratch.take("new", depth * width, sums.shape[1])
     weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", depth, width, pixels))
-    new[:, _TERMS + 2 :].view(depth, width, -1).copy_(torch.bmm(upstream, weights.permute(1, 2, 0)).permute(2, 0, 1))
+    v_values = new[:, _TERMS + 2 : _TERMS + 2 + upstream.shape[1]].view(depth, width, -1)
+    v_values.copy_(torch.bmm(upstream, weights.permute(1, 2, 0)).permute(2, 0, 1))
     seen = torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
     share = weights.mul_(seen.permute(1, 0, 2))
     rest = scratch.take("rest", depth, width, pixels)
@@ -278,8 +292,6 @@ def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: 
     new[:, :_TERMS] = _central_moments(block.columns[6:8], torch.mm(monomials, g.t())).t()
     if absgrad:
         new[:, _TERMS : _TERMS + 2] = _absolute_pulls(block.columns, monomials, g, scratch).t()
-    else:
-        new[:, _TERMS : _TERMS + 2] = 0.0
     sums.index_add_(0, block.splats.long(), new)  # several times faster with 64-bit indices
 
 
@@ -364,7 +376,8 @@ class _Composite(torch.autograd.Function):
             upstream = _to_cells(torch.cat([v_colors, v_alphas], dim=-1), grid)
             behind = (image * upstream).sum(dim=1)
             transmittance = torch.ones_like(behind)
-            sums = values.new_zeros(values.shape[0], _TERMS + 2 + upstream.shape[1])
+            channels = values.shape[1]
+            sums = values.new_zeros(values.shape[0], _padded(_TERMS + 2 + channels + 1))
             for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
                 for stretch in _march(lists, settings.cells_per_block(behind.shape[1])):
                     arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
@@ -383,4 +396,4 @@ class _Composite(torch.autograd.Function):
             v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
             v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
             v_opacities = dense(opacities, [m / ellipses.opacity])
-        return v_means2d, v_conics, v_opacities, sums[:, _TERMS + 2 : -1], None, None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, _TERMS + 2 : _TERMS + 2 + channels], None, None, None, None
