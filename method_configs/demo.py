@@ -8,18 +8,21 @@ import os
 import shutil
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psutil
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from method_configs.held_out_views import HeldOutViews, render_held_out
 from method_configs.training_process import TrainingProcess
+
+if TYPE_CHECKING:
+    from method_configs.held_out_views import HeldOutViews
 
 METHODS = {"without": "fillerbuster-none", "with": "fillerbuster"}
 """The two runs that are compared, by their names in metrics.json."""
@@ -54,11 +57,8 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
             bar(1, 1)
         with clock.stage("train"):
             clock.seconds |= _train_both(output, seed=seed, iterations=iterations, model=model, bars=bars)
-        views: dict[str, HeldOutViews] = {}
         with clock.stage("render"):
-            for name, method in METHODS.items():
-                with bars.stage(f"Held-out views {name} completion") as bar:
-                    views[name] = render_held_out(run_folder(output, method), output / "capture", on_view=bar)
+            views = _render_both(output, bars)
         with clock.stage("report"), bars.stage("Report") as bar:
             from method_configs.demo_report import write_report
 
@@ -124,6 +124,18 @@ def _train_both(output: Path, *, seed: int, iterations: int, model: Path | None,
         "generate": started["with"].seconds["generate"],
         **{f"train_{name}": process.seconds["all"] - process.seconds["generate"] for name, process in started.items()},
     }
+
+
+def _render_both(output: Path, bars: _Bars) -> dict[str, HeldOutViews]:
+    """Held-out views of both runs; nerfstudio is imported no earlier than here, because that takes a while."""
+    views: dict[str, HeldOutViews] = {}
+    for name, method in METHODS.items():
+        with bars.stage(f"Held-out views {name} completion") as bar, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of nerfstudio's dependencies about each other
+            from method_configs.held_out_views import render_held_out
+
+            views[name] = render_held_out(run_folder(output, method), output / "capture", on_view=bar)
+    return views
 
 
 def _clear(output: Path) -> None:

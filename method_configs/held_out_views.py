@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,11 @@ from torch import Tensor
 
 from fb_core.data.captures import read_capture
 from fb_core.evaluation.image_metrics import mean_quality, psnr
+from fb_nerfstudio.bridge import batch_image
+from fb_nerfstudio.completed_views import CompletedViews
+
+if TYPE_CHECKING:
+    from nerfstudio.pipelines.base_pipeline import Pipeline
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,38 +56,55 @@ class HeldOutViews:
 def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], None] | None = None) -> HeldOutViews:
     """Load the run whose folder holds config.yml and render every held-out view of its capture.
 
-    Raises ValueError when the run has no held-out views, or when the capture does not say which of them are covered.
+    Raises ValueError when the run is not one of ours, has no held-out views, or when its capture does not say which are covered.
     """
-    from nerfstudio.utils.eval_utils import eval_setup
+    from fb_nerfstudio.datamanager import FillerbusterDataManager
 
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio's own tables would tear our progress bars apart
-        _, pipeline, _, _ = eval_setup(run / "config.yml", test_mode="test")
-    pipeline.eval()
-    covered = {frame.image_path.name: frame.extra.get("covered") for frame in read_capture(capture).frames}
-    views = pipeline.datamanager.fixed_indices_eval_dataloader
+    pipeline = _load(run)
+    manager = pipeline.datamanager
+    if not isinstance(manager, FillerbusterDataManager):
+        raise ValueError(f"{run}: expected a run of fillerbuster or fillerbuster-none, got one with {type(manager).__name__}")
+    views = manager.fixed_indices_eval_dataloader
     if len(views) == 0:
-        raise ValueError(f"{run}: the run has no held-out views; capture them, or make the room with held_out above 0")
-    names = pipeline.datamanager.eval_dataset.image_filenames
-    renders, truth, accumulation, verdicts = [], [], [], []
+        raise ValueError(f"{run}: the run has no held-out views; make the capture with some")
+    verdicts = _verdicts(capture, [Path(name).name for name in manager.eval_dataset.image_filenames])
+    renders, truth, accumulation = [], [], []
     for number, (camera, batch) in enumerate(views):
         outputs = pipeline.model.get_outputs_for_camera(camera)
-        renders.append(outputs["rgb"].cpu().movedim(-1, 0))
+        renders.append(outputs["rgb"].cpu().movedim(-1, 0).clamp(0, 1))
         accumulation.append(outputs["accumulation"].cpu().squeeze(-1))
-        picture = batch["image"][..., :3].cpu()
-        truth.append((picture.float() / 255 if picture.dtype == torch.uint8 else picture).movedim(-1, 0))
-        verdict = covered[Path(names[batch["image_idx"]]).name]
-        if verdict is None:
-            raise ValueError(f"{capture}: held-out view {names[batch['image_idx']]} does not say whether it is 'covered'")
-        verdicts.append(bool(verdict))
+        truth.append(batch_image(batch, "cpu"))
         if on_view is not None:
             on_view(number + 1, len(views))
-    bank = pipeline.datamanager.generated_views
-    pictures = () if bank is None else tuple(image.movedim(-1, 0).float() / 255 for image in bank.images)
-    roles = () if bank is None else tuple(origin.role for origin in bank.origins)
+    bank = manager.generated_views
     return HeldOutViews(
-        renders=torch.stack(renders).clamp(0, 1),
+        renders=torch.stack(renders),
         truth=torch.stack(truth),
         accumulation=torch.stack(accumulation),
-        covered=torch.tensor(verdicts),
-        generated=tuple(zip(roles, pictures, strict=True)),
+        covered=torch.tensor([verdicts[batch["image_idx"]] for _, batch in views]),
+        generated=() if bank is None else tuple(_pictures(bank)),
     )
+
+
+def _load(run: Path) -> Pipeline:
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio's tables would tear progress bars apart
+        pipeline = eval_setup(run / "config.yml", test_mode="test")[1]
+    return pipeline.eval()
+
+
+def _verdicts(capture: Path, names: list[str]) -> list[bool]:
+    """Whether each of these pictures of the capture is covered."""
+    told = {frame.image_path.name: frame.extra.get("covered") for frame in read_capture(capture).frames}
+    unsaid = [name for name in names if told.get(name) is None]
+    if unsaid:
+        raise ValueError(
+            f"{capture}: held-out view {unsaid[0]} does not say whether it is 'covered'; make the capture with fillerbuster rooms"
+        )
+    return [bool(told[name]) for name in names]
+
+
+def _pictures(bank: CompletedViews) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:
+    for origin, image in zip(bank.origins, bank.images, strict=True):
+        yield origin.role, image.movedim(-1, 0).float() / 255
