@@ -115,6 +115,7 @@ TOY = Recipe(
     raymap_vae=dataclasses.replace(_VAE, in_channels=6, norm="none"),
     dit=DiTConfig(heads=1, head_dim=16, depth=1, text_width=0),
     pool=PoolConfig(families=("narrow",), rooms=4, views=3, image_size=16, supersample=1),
+    vae_pool=PoolConfig(families=("narrow",), rooms=4, views=3, image_size=16, supersample=1),
     image_vae_loop=_LOOP,
     raymap_vae_loop=_LOOP,
     dit_loop=_LOOP,

@@ -28,6 +28,7 @@ TOY = Recipe(
     raymap_vae=VAEConfig(in_channels=6, padding="replicate", **_SMALL_VAE),
     dit=DiTConfig(heads=2, head_dim=16, depth=1, text_width=0),
     pool=PoolConfig(rooms=3, views=5, image_size=16, renewed_per_step=0.5, supersample=1),
+    vae_pool=PoolConfig(rooms=2, views=4, image_size=16, renewed_per_step=0.5, supersample=1),
     image_vae_loop=_LOOP,
     raymap_vae_loop=_LOOP,
     dit_loop=_LOOP,

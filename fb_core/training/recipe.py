@@ -39,7 +39,9 @@ class Recipe:
     dit: DiTConfig
     """Architecture of the transformer."""
     pool: PoolConfig
-    """Rooms to learn from."""
+    """Rooms that the transformer learns from."""
+    vae_pool: PoolConfig
+    """Rooms that the autoencoders learn from (single views; fewer will do)."""
     image_vae_loop: LoopConfig
     """Optimisation of the image autoencoder."""
     raymap_vae_loop: LoopConfig
@@ -89,7 +91,7 @@ def run_stage(
         if config.norm == "none":
             start_linear(network, torch.Generator().manual_seed(recipe.seed))
         network.to(device)
-        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, with_images=stage == "image-vae")
+        pool = RoomPool(recipe.vae_pool, seed=recipe.seed + 1, device=device, with_images=stage == "image-vae")
         task = VAEStage(network, pool, kind=stage, config=loss, seed=recipe.seed)
         loop = recipe.image_vae_loop if stage == "image-vae" else recipe.raymap_vae_loop
     run = Run(task, loop if steps is None else dataclasses.replace(loop, steps=steps), folder / stage)
