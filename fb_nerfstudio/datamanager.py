@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
 import random
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,33 +16,27 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fb_core.checkpoint import read_config
-from fb_core.data.captures import validate_capture
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
-from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster
+from fb_core.inpainter import Fillerbuster
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
 from fb_nerfstudio.dataparser import without_open3d
+from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
 from fb_nerfstudio.unseen import TRAINED_STEPS, coarse, find_unseen, render_geometry, surface_points, unseen_gaussians, with_unseen_masks
 from fb_nerfstudio.viewer import CompletionPanel
 
 COMPLETION_FOLDER = "completion"
 """Where in the run's folder the generated views are written as a capture."""
 _logger = logging.getLogger(__name__)
-
-
-class Refused(SystemExit, ValueError):
-    """A capture or option that cannot be trained on: a ValueError that, uncaught, ends the command with its one sentence and code 1."""
 
 
 @dataclass
@@ -80,7 +72,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
                 f"fillerbuster trains in one process, got {world_size}: splats that grow cannot be shared; use --machine.num-devices 1"
             )
         if test_mode == "val":  # a training; evaluation commands read what a training has already accepted
-            _refuse_bad_capture(config)
+            refuse_bad_capture(config)
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self.completion_panel = CompletionPanel()  # public: nerfstudio's viewer looks for it by type
@@ -201,11 +193,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         _save_checkpoint(trainer, step)
 
     def _check_inpainter(self) -> None:
-        """Raises Refused with one sentence for a model folder that is missing or not one; weights are not read yet."""
-        try:
-            read_config(self.config.completion.model or BUNDLED_MODEL)
-        except ValueError as error:
-            raise Refused(str(error)) from None
+        """Raises Refused with one sentence for a model folder that cannot be used."""
+        refuse_bad_model(self.config.completion)
 
     def _load_inpainter(self) -> Inpainter:
         """The diffusion model, on the training device. Raises Refused with one sentence when its weights are broken."""
@@ -291,16 +280,6 @@ class _Bars:
         self._panel.report(f"Generating, {title}, step {done} of {steps}")
 
 
-def _refuse_bad_capture(config: FillerbusterDataManagerConfig) -> None:
-    """Raises Refused with one sentence before anything is loaded, when the data is a nerfstudio capture that is broken."""
-    if not isinstance(config.dataparser, NerfstudioDataParserConfig):
-        return
-    try:
-        validate_capture(Path(config.data or config.dataparser.data))
-    except ValueError as error:
-        raise Refused(str(error)) from None
-
-
 @contextmanager
 def _own_randomness(device: torch.device | str) -> Iterator[None]:
     """Leaves torch's global random state as it was: training goes on as if nothing had been generated."""
@@ -310,23 +289,6 @@ def _own_randomness(device: torch.device | str) -> Iterator[None]:
 
 
 def _save_checkpoint(trainer: Any, step: int) -> None:
-    """A checkpoint that a kill at any moment leaves whole: written beside the others, then renamed.
-
-    It counts as the state after the previous step, so that a resumed run begins with this one (step 0 has no previous step).
-    """
-    if trainer is None:
-        return
-    folder = Path(trainer.checkpoint_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as unfinished:
-        trainer.checkpoint_dir = Path(unfinished)
-        try:
-            trainer.save_checkpoint(max(step - 1, 0))
-        finally:
-            trainer.checkpoint_dir = folder
-        for path in Path(unfinished).glob("*.ckpt"):
-            os.replace(path, folder / path.name)
-            if trainer.config.save_only_latest_checkpoint:
-                for old in folder.glob("*.ckpt"):
-                    if old.name != path.name:
-                        old.unlink()
+    """A checkpoint of the state before this step; a resumed run begins with it (with step 1 where there is none before)."""
+    if trainer is not None:
+        trainer.save_checkpoint(max(step - 1, 0))

@@ -21,6 +21,7 @@ from fb_nerfstudio.datamanager import FillerbusterDataManagerConfig
 from fb_nerfstudio.fused_adam import FusedAdamOptimizerConfig
 from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
 from fb_nerfstudio.splat_model import FillerbusterSplatModelConfig
+from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 
 _ON_GPU = torch.cuda.is_available()
 _ITERATIONS = 30000 if _ON_GPU else 3000
@@ -64,7 +65,7 @@ def _optimizers() -> dict[str, Any]:
 
 
 def _trainer() -> TrainerConfig:
-    return TrainerConfig(
+    return FillerbusterTrainerConfig(
         method_name="fillerbuster",
         machine=MachineConfig(device_type="cuda" if _ON_GPU else "cpu"),
         max_num_iterations=_ITERATIONS,

@@ -72,6 +72,7 @@ class ToyTrainer:
         self.config = SimpleNamespace(save_only_latest_checkpoint=True)
 
     def save_checkpoint(self, step: int) -> None:
+        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         torch.save({"step": step, "pipeline": self.pipeline.datamanager.state_dict()}, self.checkpoint_dir / f"step-{step:09d}.ckpt")
 
 

@@ -1,0 +1,65 @@
+"""nerfstudio's trainer, careful with files: bad input leaves nothing behind, and a kill leaves whole checkpoints."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
+
+
+@dataclass
+class FillerbusterTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer options; capture and model are looked at before the run has a folder."""
+
+    _target: type = field(default_factory=lambda: FillerbusterTrainer)
+    """target class to instantiate"""
+
+    def set_timestamp(self) -> None:
+        """Name the run. This is the first thing ``ns-train`` does with its options, so it is here that bad input is refused."""
+        self.refuse_bad_input()
+        super().set_timestamp()
+
+    def refuse_bad_input(self) -> None:
+        """Raises Refused with one sentence for what cannot be trained on: devices, capture, model folder, checkpoint to go on from.
+
+        Where a run goes on from a checkpoint the model may be gone: it is needed only if generated views are still missing there.
+        """
+        datamanager: Any = self.pipeline.datamanager
+        processes = self.machine.num_devices * self.machine.num_machines
+        if processes != 1:
+            raise Refused(f"machine: fillerbuster trains in one process, got {processes}; use --machine.num-devices 1")
+        refuse_bad_capture(datamanager)
+        if self.load_dir is None and self.load_checkpoint is None:
+            refuse_bad_model(datamanager.completion)
+        elif self.load_dir is not None and not any(self.load_dir.glob("step-*.ckpt")):
+            raise Refused(f"load_dir {self.load_dir}: no checkpoint (step-*.ckpt) there; give a run's folder nerfstudio_models")
+        elif self.load_checkpoint is not None and not self.load_checkpoint.is_file():
+            raise Refused(f"load_checkpoint {self.load_checkpoint}: no such file; check the path")
+
+
+class FillerbusterTrainer(Trainer):
+    """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on."""
+
+    config: FillerbusterTrainerConfig
+
+    def save_checkpoint(self, step: int) -> None:
+        """As nerfstudio, but written beside the earlier checkpoints and then renamed; only then are the earlier ones removed."""
+        folder = Path(self.checkpoint_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as unfinished:
+            self.checkpoint_dir = Path(unfinished)
+            try:
+                super().save_checkpoint(step)
+            finally:
+                self.checkpoint_dir = folder
+            for path in Path(unfinished).glob("*.ckpt"):
+                os.replace(path, folder / path.name)
+                for old in folder.glob("*.ckpt") if self.config.save_only_latest_checkpoint else ():
+                    if old.name != path.name:
+                        old.unlink()
