@@ -1,18 +1,8 @@
-"""Front-to-back alpha compositing of screen ellipses, by cells of 8x8 pixels, with an analytic gradient.
+"""Front-to-back alpha compositing of screen ellipses with an analytic gradient (pure torch, bounded memory).
 
-Inside a cell, with (u, v) a pixel's offset from the cell centre, the exponent of a Gaussian is a quadratic polynomial:
-
-    log(opacity) - d^T conic d / 2  =  k0 + k1 u + k2 v + k3 u^2 + k4 u v + k5 v^2
-
-so a block of B ranks x S cells x 64 pixels is one thin matrix product with the 6x64 matrix of monomials, one exp, and
-B in-place multiplications for the transmittance. Blocks hold a bounded number of pairs and stay in the cache; cells whose
-pixels are all opaque drop out. The backward pass walks the same blocks front to back again (nothing is stored): what lies
-behind a Gaussian is the known total less what has been passed. The gradient of a pair is its derivative g by the exponent;
-the sums of g times monomials (again one product with the 6x64 matrix) give the moments from which every gradient follows.
-
-Rules per pixel (gsplat): skip alpha < 1/255; cap alpha; stop before the Gaussian that would bring the transmittance to
-1e-4 or below. A pair above the cap passes no gradient to its exponent. The exponent of a positive definite conic is never
-positive, so gsplat's test for sigma < 0 only ever rejects rounding noise and is left out.
+The backward pass walks the blocks of `torch_blocks` front to back once more, nothing is stored: what lies behind a Gaussian is the
+known total less what has been passed. The gradient of a pair is its derivative g by the exponent; sums of g times the monomials
+(one thin matrix product) are moments, from which every gradient follows. A pair above the cap passes no gradient to its exponent.
 """
 
 from __future__ import annotations
@@ -20,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -30,18 +19,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from fb_nerfstudio.single_thread import single_thread
+from fb_nerfstudio.torch_blocks import PAIRS_PER_BLOCK, TERMS, THIN, TRANSMITTANCE_MIN, Block, Scratch, march, padded, table_of
 from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses, Strips, list_cells, measure_strips, slabs
-from fb_nerfstudio.torch_projection import ALPHA_MIN
 
-TRANSMITTANCE_MIN = 1e-4
-PAIRS_PER_BLOCK = 2**18
 ROWS_PER_LIST = 2**20
-_NEVER = -1e4
-_TERMS, _COLUMNS = 6, 11
-# Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels, deeper where there are fewer cells.
-_SHALLOWEST = 16
-# A layer (one rank) with fewer values than this is scanned by torch; larger layers are walked one by one, which is faster.
-_THIN = 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,9 +37,6 @@ class CompositingSettings:
     """Pairs (Gaussian, pixel) worked on at once: bounds the scratch memory and should fit the cache."""
     rows_per_list: int = ROWS_PER_LIST
     """Pairs (Gaussian, cell) listed at once: bounds the memory of the lists."""
-
-    def cells_per_block(self, pixels: int) -> int:
-        return max(1, self.pairs_per_block // (_SHALLOWEST * pixels))
 
 
 def composite(
@@ -79,196 +57,13 @@ def composite(
     return _Composite.apply(means2d, conics, opacities, values, chosen, ellipses, grid, settings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Table:
-    """What a block needs to know, one row for each chosen Gaussian (one gather fetches all of it)."""
-
-    rows: Float[Tensor, "v r"]
-    """log2(opacity), two blanks, -A/2, -B, -C/2, x, y, A, B, C, the values, 1; conic entries times log2(e); then padding."""
-    channels: int
-    """Values and the 1."""
-    monomials: Float[Tensor, "6 p"]
-    centers: Float[Tensor, "2 cells"]
-    alpha_threshold: float
-    """The largest number below 1/255."""
-    cap: float | None
-    """Largest alpha; None where no opacity reaches it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Block:
-    """B ranks deep, S cells wide, P pixels each; where two of them are one index the order is (b, s)."""
-
-    splats: Int32[Tensor, " bs"]
-    """Rows of the table; padding points at some row and has alpha 0."""
-    columns: Float[Tensor, "11 bs"]
-    """Coefficients k0 .. k5, dx and dy (mean less cell centre), A, B, C: to the base 2 like the table."""
-    values: Float[Tensor, "b s d1"]
-    """Channels, and a last one of ones, which composites to alpha."""
-    alpha: Float[Tensor, "b s p"]
-    light: Float[Tensor, "b s p"]
-    """Transmittance in front of each."""
-    capped: Tensor | None
-    """Pairs at the cap (bool), or None where there are none."""
-
-
-class _Scratch:
-    """Reused buffers: fresh allocations of this size would cost page faults at every block."""
-
-    def __init__(self, like: Tensor):
-        self._like = like
-        self._buffers: dict[str, Tensor] = {}
-        self._views: dict[tuple[str | int, ...], Tensor] = {}
-
-    def take(self, name: str, *shape: int) -> Tensor:
-        view = self._views.get((name, *shape))
-        if view is None:
-            size = math.prod(shape)
-            if name not in self._buffers or self._buffers[name].numel() < size:
-                self._buffers[name] = self._like.new_zeros(size)
-                self._views = {key: value for key, value in self._views.items() if key[0] != name}
-            view = self._views[(name, *shape)] = self._buffers[name][:size].view(shape)
-        return view
-
-
-def _padded(width: int) -> int:
-    """Row length for gathers and sums of rows: torch handles whole vectors twice as fast."""
-    return -(-width // 16) * 16
-
-
-def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
-    """1, u, v, u^2, u v, v^2 at the pixels of a cell, row by row."""
-    offsets = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
-    v, u = (grid.reshape(-1) for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
-    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])
-
-
-def _table(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> _Table:
-    below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
-    used = _COLUMNS + values.shape[1] + 1
-    rows = values.new_empty(values.shape[0], _padded(used))
-    A, B, C = (column * math.log2(math.e) for column in (ellipses.A, ellipses.B, ellipses.C))
-    blank = torch.zeros_like(A)
-    torch.stack(
-        [ellipses.opacity.log2(), blank, blank, -0.5 * A, -B, -0.5 * C, ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :_COLUMNS]
-    )
-    rows[:, _COLUMNS : used - 1] = values
-    rows[:, used - 1 :] = 1.0
-    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
-    may_cap = values.shape[0] > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
-    return _Table(
-        rows=rows,
-        channels=values.shape[1] + 1,
-        monomials=_monomials(grid.size, values),
-        centers=torch.stack(grid.centers(values)),
-        alpha_threshold=float(below),
-        cap=cap if may_cap else None,
-    )
-
-
-class _Stretch:
-    """Cells of similar length that are walked together, front to back, until most are opaque or all are done."""
-
-    def __init__(self, cells: Tensor, counts: Tensor, starts: Tensor, rank: int):
-        self.cells, self.rest = cells, None
-        """`rest`: after `blocks`, the stretch of the cells that still need work, or None."""
-        self._counts, self._starts, self._rank = counts, starts, rank
-
-    def blocks(self, table: _Table, listed: Tensor, transmittance: Tensor, scratch: _Scratch, budget: int) -> Iterator[_Block]:
-        """The blocks in order, covering the first cells of the stretch; at the end their transmittance [cells, p] is up to date."""
-        pixels, rank, lengths = table.monomials.shape[1], self._rank, self._counts.tolist()
-        centers = table.centers.index_select(1, self.cells)[:, None]
-        light, deepest, width = transmittance.index_select(0, self.cells), lengths[0], len(lengths)
-        while rank < deepest:
-            while lengths[width - 1] <= rank:  # long lists come first, so finished cells are at the end
-                width -= 1
-            depth = min(max(_SHALLOWEST, budget // (width * pixels)), deepest - rank)
-            splats, padding = self._pick(listed, rank, depth, width, full=lengths[width - 1] >= rank + depth)
-            block, after = _block(table, splats, padding, centers[..., :width], light[:width], depth, scratch)
-            light[:width] = after[-1]
-            rank += depth
-            opaque = float(after[-1].min()) <= TRANSMITTANCE_MIN
-            if opaque:
-                _stop(block.alpha, after)
-            yield block
-            if opaque and rank < deepest:
-                still = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
-                if int(still.sum()) <= 0.75 * width:
-                    kept = still.nonzero()[:, 0]
-                    if kept.numel():
-                        self.rest = _Stretch(*(column.index_select(0, kept) for column in (self.cells, self._counts, self._starts)), rank)
-                    break
-        transmittance.index_copy_(0, self.cells, light)
-
-    def _pick(self, listed: Tensor, rank: int, depth: int, width: int, full: bool) -> tuple[Tensor, Tensor | None]:
-        """Table rows of the ranks rank .. rank + depth of the first `width` cells, and what of it is padding."""
-        ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=listed.device)[:, None]
-        positions = ranks + self._starts[:width]
-        padding = None if full else ranks >= self._counts[:width]
-        if padding is not None:
-            positions.masked_fill_(padding, 0)
-        return listed.index_select(0, positions.view(-1)), padding
-
-
-def _block(
-    table: _Table, splats: Tensor, padding: Tensor | None, centers: Tensor, light: Tensor, depth: int, scratch: _Scratch
-) -> tuple[_Block, Tensor]:
-    """Evaluate all pairs; also returns the transmittance behind each [b, s, p]."""
-    width, pixels = light.shape
-    rows = table.rows.index_select(0, splats)
-    k = scratch.take("columns", _COLUMNS, depth * width).copy_(rows[:, :_COLUMNS].t())
-    k[6:8].view(2, depth, width).sub_(centers)
-    dx, dy = k[6], k[7]
-    torch.mul(k[8:10], dx, out=k[1:3]).addcmul_(k[9:11], dy)
-    k[0].addcmul_(dx, k[1], value=-0.5).addcmul_(dy, k[2], value=-0.5)
-    if padding is not None:
-        k[0].masked_fill_(padding.view(-1), _NEVER)
-    alpha = torch.mm(k[:_TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
-    # To the base 2 because torch's exp2 is twice as fast as its exp.
-    alpha = F.threshold_(alpha.exp2_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
-    capped = None
-    if table.cap is not None and float(alpha.max()) > table.cap:
-        capped = alpha > table.cap
-        alpha.clamp_(max=table.cap)
-    lights = scratch.take("light", depth + 1, width, pixels)
-    lights[0] = light
-    _darken(alpha, lights)
-    values = rows[:, _COLUMNS : _COLUMNS + table.channels].view(depth, width, -1)
-    return _Block(splats=splats, columns=k, values=values, alpha=alpha, light=lights[:depth], capped=capped), lights[1:]
-
-
-def _darken(alpha: Tensor, lights: Tensor) -> None:
-    """lights[b + 1] = lights[b] (1 - alpha[b]), in place."""
-    torch.sub(1.0, alpha, out=lights[1:])
-    if alpha[0].numel() < _THIN:
-        torch.cumprod(lights, dim=0, out=lights)
-        return
-    for before, after in pairwise(lights.unbind(0)):
-        after.mul_(before)
-
-
-def _stop(alpha: Tensor, after: Tensor) -> None:
-    """Take out the Gaussian that would end a pixel, and all behind it. In floats: comparisons cost five times as much."""
-    alpha.mul_(torch.threshold(after, TRANSMITTANCE_MIN, 0.0).mul_(1e30).clamp_(max=1.0))
-
-
-def _march(lists: CellLists, width: int) -> Iterator[_Stretch]:
-    """All cells that have something to draw, in stretches of at most `width` cells, long lists first."""
-    busy = torch.argsort(lists.counts, descending=True)[: int((lists.counts > 0).sum())]
-    for cells in busy.split(width) if busy.numel() else ():
-        stretch = _Stretch(cells, lists.counts.index_select(0, cells), lists.starts.index_select(0, cells), 0)
-        while stretch is not None:
-            yield stretch
-            stretch = stretch.rest
-
-
-def _forward_block(block: _Block, image: Tensor, scratch: _Scratch) -> None:
+def _forward_block(block: Block, image: Tensor, scratch: Scratch) -> None:
     """Add the block to the cells [s, d1, p] of its stretch."""
     weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", *block.alpha.shape))
     image[: weights.shape[1]].baddbmm_(block.values.permute(1, 2, 0), weights.permute(1, 0, 2))
 
 
-def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: _Scratch):
+def _backward_block(block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: Scratch):
     """Add the block's gradients to `sums` [v, r]; `behind` [s, p], the part of the loss that lies behind, is advanced in place.
 
     The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
@@ -277,7 +72,7 @@ def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: 
     upstream, behind = upstream[:width], behind[:width]
     new = scratch.take("new", depth * width, sums.shape[1])
     weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", depth, width, pixels))
-    v_values = new[:, _TERMS + 2 : _TERMS + 2 + upstream.shape[1]].view(depth, width, -1)
+    v_values = new[:, TERMS + 2 : TERMS + 2 + upstream.shape[1]].view(depth, width, -1)
     v_values.copy_(torch.bmm(upstream, weights.permute(1, 2, 0)).permute(2, 0, 1))
     seen = torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
     share = weights.mul_(seen.permute(1, 0, 2))
@@ -289,15 +84,15 @@ def _backward_block(block: _Block, monomials: Tensor, upstream: Tensor, behind: 
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
-    new[:, :_TERMS] = _central_moments(block.columns[6:8], torch.mm(monomials, g.t())).t()
+    new[:, :TERMS] = _central_moments(block.columns[6:8], torch.mm(monomials, g.t())).t()
     if absgrad:
-        new[:, _TERMS : _TERMS + 2] = _absolute_pulls(block.columns, monomials, g, scratch).t()
+        new[:, TERMS : TERMS + 2] = _absolute_pulls(block.columns, monomials, g, scratch).t()
     sums.index_add_(0, block.splats.long(), new)  # several times faster with 64-bit indices
 
 
 def _pass_by(behind: Tensor, share: Tensor, rest: Tensor) -> None:
     """rest[b] = behind - share[0] - .. - share[b]; then `behind` takes the last of these."""
-    if behind.numel() < _THIN:
+    if behind.numel() < THIN:
         torch.sub(behind, torch.cumsum(share, dim=0, out=rest), out=rest)
         behind.copy_(rest[-1])
         return
@@ -316,7 +111,7 @@ def _central_moments(d: Float[Tensor, "2 bs"], local: Float[Tensor, "6 bs"]) -> 
     return torch.stack([total, first[0], first[1], squares[0], mixed, squares[1]])
 
 
-def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, scratch: _Scratch) -> Float[Tensor, "2 bs"]:
+def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, scratch: Scratch) -> Float[Tensor, "2 bs"]:
     """Sums over pixels of |g| |conic d|, the gradient of the mean before its signs cancel; conic d is linear in (u, v). Uses g up."""
     size, sums = g.abs_(), []
     for constant, along_u, along_v in ((1, 8, 9), (2, 9, 10)):
@@ -350,12 +145,12 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, values, chosen, ellipses: Ellipses, grid: CellGrid, settings: CompositingSettings):
         with single_thread():
-            table, strips, scratch = _table(ellipses, values, grid, settings.alpha_cap), measure_strips(ellipses, grid), _Scratch(values)
+            table, strips, scratch = table_of(ellipses, values, grid, settings.alpha_cap), measure_strips(ellipses, grid), Scratch(values)
             pixels = grid.size * grid.size
             image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
             transmittance = values.new_ones(grid.count, pixels)
             for lists in _lists(ellipses, strips, grid, settings.rows_per_list, transmittance):
-                for stretch in _march(lists, settings.cells_per_block(pixels)):
+                for stretch in march(lists, pixels, settings.pairs_per_block):
                     local = image.new_zeros(stretch.cells.shape[0], *image.shape[1:])
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
                         _forward_block(block, local, scratch)
@@ -372,19 +167,19 @@ class _Composite(torch.autograd.Function):
         means2d, conics, opacities, values, chosen, image = ctx.saved_tensors
         ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
         with single_thread():
-            table, scratch = _table(ellipses, values, grid, settings.alpha_cap), _Scratch(values)
+            table, scratch = table_of(ellipses, values, grid, settings.alpha_cap), Scratch(values)
             upstream = _to_cells(torch.cat([v_colors, v_alphas], dim=-1), grid)
             behind = (image * upstream).sum(dim=1)
             transmittance = torch.ones_like(behind)
             channels = values.shape[1]
-            sums = values.new_zeros(values.shape[0], _padded(_TERMS + 2 + channels + 1))
+            sums = values.new_zeros(values.shape[0], padded(TERMS + 2 + channels + 1))
             for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
-                for stretch in _march(lists, settings.cells_per_block(behind.shape[1])):
+                for stretch in march(lists, behind.shape[1], settings.pairs_per_block):
                     arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
                         _backward_block(block, table.monomials, arriving, hidden, sums, settings.absgrad, scratch)
                     behind.index_copy_(0, stretch.cells, hidden)
-            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, : _TERMS + 2].t().contiguous().unbind(0)
+            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, : TERMS + 2].t().contiguous().unbind(0)
             A, B, C = ellipses.A, ellipses.B, ellipses.C
 
             def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
@@ -396,4 +191,4 @@ class _Composite(torch.autograd.Function):
             v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
             v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
             v_opacities = dense(opacities, [m / ellipses.opacity])
-        return v_means2d, v_conics, v_opacities, sums[:, _TERMS + 2 : _TERMS + 2 + channels], None, None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, TERMS + 2 : TERMS + 2 + channels], None, None, None, None

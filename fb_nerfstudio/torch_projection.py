@@ -1,7 +1,8 @@
 """All Gaussians into all cameras: screen ellipses, culling as gsplat does it, and the autograd function around them.
 
-The geometry of one camera, with its gradient, is in `torch_footprint`. Gradients flow to means, quats, scales, covars and
-viewmats; radii and every culling decision are constants. Backward keeps nothing but its inputs and works on the drawn rows only.
+The geometry of one camera is in `torch_footprint`, its gradient in `torch_footprint_gradient`. Gradients flow to means, quats,
+scales, covars and viewmats; radii and every culling decision are constants. Backward keeps nothing but its inputs and works on
+the drawn rows only.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from fb_nerfstudio.single_thread import single_thread
-from fb_nerfstudio.torch_footprint import Footprint, Lens, ScreenGradient, Shapes, compensation, footprint, footprint_gradient
+from fb_nerfstudio.torch_footprint import Footprint, Lens, Shapes, compensation, footprint
+from fb_nerfstudio.torch_footprint_gradient import ScreenGradient, footprint_gradient
 
 ALPHA_MIN = 1.0 / 255.0
 _LARGEST_RADIUS = 2.0**30
@@ -82,8 +84,8 @@ class Projection:
 
 def project_splats(
     means: Float[Tensor, "n 3"],
-    quats: Float[Tensor, "n 4"],
-    scales: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"] | None,
+    scales: Float[Tensor, "n 3"] | None,
     opacities: Float[Tensor, " n"],
     covars: Float[Tensor, "n 3 3"] | None,
     viewmats: Float[Tensor, "c 4 4"],
@@ -96,15 +98,10 @@ def project_splats(
     `quats` (wxyz) may have any length; a zero quaternion is the identity rotation and gets a zero gradient. `covars`, where
     given, replaces quats and scales. Rows where `usable` is False are never drawn. Gradients do not flow to Ks or opacities.
     """
-    return Projection(
-        **dict(
-            zip(
-                ("means2d", "conics", "depths", "compensations", "radii", "determinants"),
-                _Project.apply(means, quats, scales, covars, viewmats, opacities.detach(), Ks, usable, settings),
-                strict=True,
-            )
-        )
+    means2d, conics, depths, compensations, radii, determinants = _Project.apply(
+        means, quats, scales, covars, viewmats, opacities.detach(), Ks, usable, settings
     )
+    return Projection(means2d=means2d, conics=conics, depths=depths, compensations=compensations, radii=radii, determinants=determinants)
 
 
 def _radii(view: Footprint, opacity: Tensor, semantics: Semantics) -> tuple[Tensor, Tensor]:
@@ -178,14 +175,8 @@ class _Project(torch.autograd.Function):
                 def of(tensor: Tensor | None, rows: Tensor = rows) -> Tensor | None:
                     return None if tensor is None else tensor.index_select(0, rows)
 
-                incoming = ScreenGradient(
-                    **{
-                        name: None if gradient is None else of(gradient[camera])
-                        for name, gradient in dict(
-                            means2d=v_means2d, conics=v_conics, depths=v_depths, compensations=v_compensations
-                        ).items()
-                    }
-                )
+                arriving = dict(means2d=v_means2d, conics=v_conics, depths=v_depths, compensations=v_compensations)
+                incoming = ScreenGradient(**{name: None if v is None else of(v[camera]) for name, v in arriving.items()})
                 shapes, floor = Shapes.of(of(quats), of(scales), of(covars)), settings.semantics.compensation_floor
                 leaving = footprint_gradient(of(means), shapes, viewmats[camera], lens, settings.eps2d, floor, incoming)
                 parts = (leaving.means, leaving.quats, leaving.scales, leaving.covars)

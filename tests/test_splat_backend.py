@@ -58,7 +58,7 @@ def test_gsplat_takes_every_keyword_that_is_passed(monkeypatch):
 
     def recorder(*args, **kwargs):
         seen.update(signature.bind(*args, **kwargs).arguments)
-        return torch.zeros(1), torch.zeros(1), {"radii": 0}
+        return torch.zeros(1, 24, 32, 7), torch.zeros(1, 24, 32, 1), {"radii": 0}
 
     fake = ModuleType("gsplat.rendering")
     fake.rasterization = recorder
