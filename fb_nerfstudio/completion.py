@@ -19,7 +19,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import ANCHOR, CompletedViews, Origin
-from fb_nerfstudio.completion_config import CompletionConfig
+from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, PlannedRound, plan_completion
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "CompletionConfig",
     "CompletionPlan",
     "Inpainter",
+    "PlacementConfig",
     "announcement",
     "fitted_view",
     "plan_completion",
