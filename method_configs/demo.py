@@ -65,7 +65,7 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
             quality = {name: held_out.quality() for name, held_out in views.items()}
             write_report(output, views, quality, seed=seed)
             bar(1, 1)
-    metrics = {**quality, "seconds": clock.rounded(), "peak_memory_gib": round(memory["gib"], 3)}
+    metrics = {**_rounded(quality), "seconds": clock.rounded(), "peak_memory_gib": round(memory["gib"], 3)}
     (output / "metrics.json").write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     _summarize(metrics, output)
     return metrics
@@ -226,6 +226,11 @@ def _peak_memory() -> Iterator[dict[str, float]]:
     finally:
         ended.set()
         sampler.join()
+
+
+def _rounded(values: Any) -> Any:
+    """The same nested dictionary with 5 decimals, which is more than repeats of a run agree on."""
+    return {name: _rounded(value) for name, value in values.items()} if isinstance(values, dict) else round(values, 5)
 
 
 def bars_of(metrics: dict[str, Any]) -> list[tuple[str, float, str, float, bool]]:

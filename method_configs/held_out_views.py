@@ -52,7 +52,21 @@ class HeldOutViews:
         }
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without nerfstudio's tables and messages, which would tear progress bars apart."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    before, CONSOLE.quiet = CONSOLE.quiet, True
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        CONSOLE.quiet = before
+
+
 @torch.no_grad()
+@_quiet()
 def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], None] | None = None) -> HeldOutViews:
     """Load the run whose folder holds config.yml and render every held-out view of its capture.
 
@@ -89,9 +103,7 @@ def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], N
 def _load(run: Path) -> Pipeline:
     from nerfstudio.utils.eval_utils import eval_setup
 
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio's tables would tear progress bars apart
-        pipeline = eval_setup(run / "config.yml", test_mode="test")[1]
-    return pipeline.eval()
+    return eval_setup(run / "config.yml", test_mode="test")[1].eval()
 
 
 def _verdicts(capture: Path, names: list[str]) -> list[bool]:
