@@ -153,6 +153,24 @@ def test_twin_agrees_with_options(options: dict):
     check_against_twin(scene(), **options)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_no_pixel_is_missed_by_the_cell_lists(seed: int):
+    """Scales from 3e-4 to 30 (needles, plates, giants), faint ones too, at odd image sizes: the lists may drop nothing visible."""
+    g = torch.Generator().manual_seed(seed)
+    width, height = (int(torch.randint(1, 70, (1,), generator=g)) for _ in range(2))
+    inputs = scene(n=30, seed=seed, width=width, height=height)
+    inputs["scales"] = 10 ** (5 * torch.rand(30, 3, generator=g, dtype=torch.float64) - 3.5)
+    if seed % 3 == 0:
+        inputs["opacities"] *= 0.03
+    covars = covariance(inputs["quats"], inputs["scales"])
+    for semantics in ("1.4", "1.6"):
+        images = rasterization(**inputs, semantics=semantics)[0]
+        values = [inputs[name] for name in ("opacities", "colors")]
+        camera = (inputs["viewmats"][0], inputs["Ks"][0])
+        expected = dense_view(inputs["means"], covars, *values, *camera, width, height, semantics=semantics)
+        assert (images[0] - expected.image).abs().max() < 1e-9
+
+
 @pytest.mark.parametrize("degree", range(5))
 def test_twin_agrees_with_spherical_harmonics(degree: int):
     inputs = scene(n=25, cameras=2)
