@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _NODE = "/completion"
 _COLORS = ((255, 160, 30), (70, 150, 255), (90, 210, 120), (210, 110, 230), (240, 220, 80))
 _LARGEST_PICTURE = 128  # pixels; what a frustum shows
-_FRUSTUM_SHARE = 0.35  # size of a frustum, in units of the usual distance between neighbouring cameras
+_FRUSTUM_SHARE = 0.15  # size of a frustum, in units of the usual distance between neighbouring cameras
 
 
 class CompletionPanel(ViewerControl):
@@ -90,7 +90,7 @@ class CompletionPanel(ViewerControl):
             node,
             fov=float(2 * np.arctan(camera.height / 2 / float(camera.focal[0, 1]))),
             aspect=camera.width / camera.height,
-            scale=max(self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(views) * VISER_NERFSTUDIO_SCALE_RATIO),
+            scale=max(self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(self.views) * VISER_NERFSTUDIO_SCALE_RATIO),
             color=_COLORS[views.origins[index].round % len(_COLORS)],
             image=views.images[index, ::stride, ::stride].cpu().numpy(),
             wxyz=transforms.SO3.from_matrix(camera.rotations[0].double().numpy()).wxyz,  # frustums have OpenCV axes, as ours
