@@ -37,8 +37,10 @@ def to_pinholes(cameras: Cameras) -> Pinholes:
         distinct = sorted({tuple(size) for size in sizes.tolist()})
         raise ValueError(f"cameras: expected one image size, got (width, height) {distinct}; use to_pinhole_list for mixed sizes")
     width, height = sizes[0].tolist()
+    poses = cameras.camera_to_worlds  # whole numbers, where a camera path was written so
+    poses = poses.to(torch.promote_types(poses.dtype, torch.float32))
     return Pinholes(
-        camera_to_world=flip_axes(cameras.camera_to_worlds.reshape(-1, 3, 4)),
+        camera_to_world=flip_axes(poses.reshape(-1, 3, 4)),
         focal=torch.stack([cameras.fx.reshape(-1), cameras.fy.reshape(-1)], dim=-1),
         principal=torch.stack([cameras.cx.reshape(-1), cameras.cy.reshape(-1)], dim=-1),
         width=width,

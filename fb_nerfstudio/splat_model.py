@@ -222,7 +222,7 @@ class FillerbusterSplatModel(SplatfactoModel):
         if not self.training and int(camera.camera_type.item()) != CameraType.PERSPECTIVE.value:
             # ns-render and the viewer offer panoramas to every method; splats are drawn in perspective, as splatfacto does.
             camera = dataclasses.replace(camera, camera_type=torch.full_like(camera.camera_type, CameraType.PERSPECTIVE.value))
-        # ns-render reads camera paths with focal lengths in double precision, and with poses in whole numbers if they are whole.
+        # ns-render reads the focal lengths of camera paths in double precision.
         pinhole = to_pinholes(camera).to(self.device, self.means.dtype)
         if self.training:
             corrected = self.camera_optimizer.apply_to_camera(camera).reshape(-1, 3, 4)
