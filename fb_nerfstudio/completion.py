@@ -44,6 +44,9 @@ class Inpainter(Protocol):
     @property
     def size(self) -> int: ...
 
+    @property
+    def recommended_sampling(self) -> SamplingConfig: ...
+
     def complete(
         self, views: Views, *, generator: torch.Generator, sampling: SamplingConfig, on_step: Callable[[int, int], None] | None
     ) -> Views: ...
@@ -94,7 +97,7 @@ def run_completion(
         filled = model.complete(
             sequence,
             generator=torch.Generator().manual_seed(planned.seed),
-            sampling=config.sampling,
+            sampling=config.sampling(model.recommended_sampling),
             on_step=None if on_step is None else lambda step, steps, planned=planned: on_step(planned, step, steps),
         )
         new = filled[list(range(len(sequence) - len(planned.cameras), len(sequence)))]
@@ -141,7 +144,7 @@ def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainte
     sequence = len(plan.context) + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
     return (
         f"Completing the scene with {name} ({model.model_hash[:8]}): {plan.new_views} new views of {plan.size}x{plan.size} pixels "
-        f"in {len(plan.rounds)} passes of {config.steps} steps over up to {sequence} views, "
+        f"in {len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views, "
         f"conditioned on {len(plan.context)} of {plan.captured} captured views{asked}{there}."
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -49,12 +50,12 @@ class CompletionConfig:
     """Views generated together in each of these rounds."""
     image_size: int | None = None
     """Side of the square views in pixels; None is the size the model was trained at."""
-    steps: int = 24
-    """Denoising steps per round."""
-    guidance_unknown: float = 7.0
-    """Guidance scale in unknown pixels."""
-    guidance_known: float = 1.1
-    """Guidance scale in known pixels."""
+    steps: int | None = None
+    """Denoising steps per round; None is what the model's folder recommends (24 where it says nothing)."""
+    guidance_unknown: float | None = None
+    """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says nothing)."""
+    guidance_known: float | None = None
+    """Guidance scale in known pixels; None is what the model's folder recommends (the paper's 1.1 where it says nothing)."""
     seed: int = 0
     """Decides cameras, images, and which training steps draw generated views."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
@@ -79,7 +80,7 @@ class CompletionConfig:
             ("densify_views", 0),
             ("steps", 2),
         ):
-            if getattr(self, name) < least:
+            if getattr(self, name) is not None and getattr(self, name) < least:
                 raise ValueError(f"completion.{name}: expected at least {least}, got {getattr(self, name)}")
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
@@ -88,7 +89,7 @@ class CompletionConfig:
         if self.view_weight < 0:
             raise ValueError(f"completion.view_weight: expected 0 or more, got {self.view_weight}")
 
-    @property
-    def sampling(self) -> SamplingConfig:
-        """The sampler's part of these options."""
-        return SamplingConfig(steps=self.steps, guidance_unknown=self.guidance_unknown, guidance_known=self.guidance_known)
+    def sampling(self, recommended: SamplingConfig = SamplingConfig()) -> SamplingConfig:
+        """How to sample: these options where they are given, the model's recommendation elsewhere."""
+        given = {name: getattr(self, name) for name in ("steps", "guidance_unknown", "guidance_known") if getattr(self, name) is not None}
+        return dataclasses.replace(recommended, **given)

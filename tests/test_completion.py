@@ -32,6 +32,8 @@ class MeanFiller:
         self.asked: list[Views] = []
         self.sampling: list[SamplingConfig] = []
 
+    recommended_sampling = SamplingConfig()
+
     def complete(self, views, *, generator, sampling=SamplingConfig(), on_step=None) -> Views:
         self.asked.append(views)
         self.sampling.append(sampling)
@@ -263,3 +265,10 @@ def test_the_saved_folder_is_a_valid_capture_that_says_how_it_was_made(tmp_path:
 def test_nonsense_options_are_refused(option: str, value):
     with pytest.raises(ValueError, match=option):
         CompletionConfig(**{option: value})
+
+
+def test_options_that_are_not_given_come_from_the_model():
+    recommended = SamplingConfig(steps=9, guidance_unknown=1.5, guidance_known=1.0, solver="euler")
+    assert CompletionConfig().sampling(recommended) == recommended
+    given = CompletionConfig(steps=5, guidance_unknown=3.0).sampling(recommended)
+    assert (given.steps, given.guidance_unknown, given.guidance_known, given.solver) == (5, 3.0, 1.0, "euler")

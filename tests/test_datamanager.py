@@ -32,6 +32,8 @@ class GreyFiller:
 
     size, model_hash, loads, calls = 16, "feedbeef" * 8, 0, 0
 
+    recommended_sampling = SamplingConfig()
+
     def complete(self, views, *, generator, sampling=SamplingConfig(), on_step=None) -> Views:
         GreyFiller.calls += 1
         if on_step is not None:
