@@ -136,9 +136,10 @@ def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", 
     """Read a model folder onto a device.
 
     `dtype` converts the transformer and the image autoencoder (None keeps the stored precision); the raymap autoencoder is always
-    float32. On the CPU, unconverted weights stay mapped files and are shared between processes. Raises ValueError, in one
-    sentence that names the culprit, for a missing folder or file, an invalid configuration, weights of another architecture,
-    a truncated file, and a precision that the device cannot compute.
+    float32, and beside a transformer in float16 so is the image autoencoder, whose activations would overflow. On the CPU,
+    unconverted weights stay mapped files and are shared between processes. Raises ValueError, in one sentence that names the culprit,
+    for a missing folder or file, an invalid configuration, weights of another architecture, a truncated file, and a precision that the
+    device cannot compute.
     """
     folder = Path(folder)
     config, info = read_config(folder)
@@ -148,7 +149,7 @@ def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", 
     image_vae = without_weights(lambda: VAE(config.image_vae))
     raymap_vae = without_weights(lambda: VAE(config.raymap_vae))
     _load_weights(dit, folder / WEIGHT_FILES["transformer"], device, dtype)
-    _load_weights(image_vae, folder / WEIGHT_FILES["image_vae"], device, dtype)
+    _load_weights(image_vae, folder / WEIGHT_FILES["image_vae"], device, torch.float32 if dtype == torch.float16 else dtype)
     _load_weights(raymap_vae, folder / WEIGHT_FILES["raymap_vae"], device, torch.float32)
     prompt = folder / PROMPT_FILE
     embedding = _read_prompt(prompt, device) if prompt.exists() else None

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.masks import to_latent_grid
+from fb_core.networks.tiled_decoder import TiledDecoder
 from fb_core.networks.vae import VAE
 
 LATENT_CHANNELS = 16
@@ -64,10 +65,14 @@ def encode_known(
     image_vae: VAE,
     raymap_vae: VAE,
     views_at_once: int = 16,
+    generator: torch.Generator | None = None,
 ) -> Conditioning:
-    """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1)."""
-    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once)
-    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once)
+    """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
+
+    With a generator (on the CPU) the posteriors are sampled, otherwise their means are taken.
+    """
+    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once, generator)
+    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generator)
     return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known))
 
 
@@ -80,14 +85,22 @@ def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: 
     return Conditioning(channels=null.expand(like.channels.shape))
 
 
-def encode_in_chunks(vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int) -> Float[Tensor, "n 16 lh lw"]:
-    """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own precision."""
-    return torch.cat([vae.encode(chunk) for chunk in pixels.split(views_at_once)])
+def encode_in_chunks(
+    vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int, generator: torch.Generator | None = None
+) -> Float[Tensor, "n 16 lh lw"]:
+    """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own precision.
+
+    With a generator they are samples, which do not depend on how many views are encoded at a time.
+    """
+    return torch.cat([vae.encode(chunk, generator) for chunk in pixels.split(views_at_once)])
 
 
-def decode_in_chunks(vae: VAE, latents: Float[Tensor, "n 16 lh lw"], views_at_once: int = 16) -> Float[Tensor, "n c h w"]:
-    """Pixels in [0, 1] of n views, a few at a time."""
-    return torch.cat([vae.decode(chunk, clamp=True) for chunk in latents.split(views_at_once)])
+def decode_in_chunks(
+    vae: VAE, latents: Float[Tensor, "n 16 lh lw"], views_at_once: int = 16, tile: int | None = None
+) -> Float[Tensor, "n c h w"]:
+    """Pixels in [0, 1] of n views, a few at a time; with a `tile`, each of them in tiles of so many pixels (`TiledDecoder`)."""
+    decoder = None if tile is None else TiledDecoder(vae.decoder, tile)
+    return torch.cat([vae.decode(chunk, clamp=True, decoder=decoder) for chunk in latents.split(views_at_once)])
 
 
 def join(state: Float[Tensor, "*b 32 h w"], conditioning: Conditioning) -> Float[Tensor, "*b 66 h w"]:

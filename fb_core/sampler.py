@@ -8,12 +8,14 @@ map never leaves its views.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fb_core.conditioning import LATENT_CHANNELS, Conditioning, join, unsplit
+from fb_core.conditioning import LATENT_CHANNELS, Conditioning, join, split, unsplit
 
 Predict = Callable[[Float[Tensor, "n 32 h w"], float, Int[Tensor, "n"] | None], Float[Tensor, "b n 32 h w"]]
 """(state of some views, time, which views they are (None: all)) -> velocity under each branch of guidance."""
@@ -21,6 +23,46 @@ VelocityField = Callable[[Float[Tensor, "n 32 h w"], float], Float[Tensor, "n 32
 """dz/dt at a state and a time."""
 OnStep = Callable[[int, int], None]
 """(steps done, steps in all), called after every step."""
+
+
+SOLVERS = ("euler", "ab2")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig:
+    """How a sequence is denoised, and in how much memory."""
+
+    steps: int = 24
+    """Denoising steps; each evaluates the network once (twice with guidance, three times with a prompt)."""
+    guidance_unknown: float = 7.0
+    """Classifier-free guidance scale where content is unknown (paper: 7)."""
+    guidance_known: float = 1.1
+    """Guidance scale where content is known (paper: 1.1)."""
+    guidance_text: float = 10.0
+    """Guidance scale of a prompt; without a prompt, or at 0, text costs nothing."""
+    solver: str = "ab2"
+    """'euler' or 'ab2' (second-order Adams-Bashforth: Euler's error in a third of the steps)."""
+    shift: float = 1.0
+    """Time shift of the grid; above 1 spends more steps near the noise."""
+    window: int | None = None
+    """Views denoised together; None is all of them (best for images; the paper uses 8 for poses)."""
+    rounds: int = 1
+    """Random partitions into windows that are averaged per step."""
+    views_at_once: int | None = None
+    """Views that pass through an autoencoder together; None is as many as memory allows, at most 16."""
+    sample_posterior: bool = False
+    """Condition on samples of the autoencoders' posteriors, as the original does, instead of on their means."""
+    memory_budget_bytes: int | None = None
+    """Most memory, weights included, in bytes; None is what the machine has. Decides how the work is cut (`fb_core.memory`)."""
+
+    def __post_init__(self) -> None:
+        time_grid(self.steps, shift=self.shift)
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver: expected 'euler' or 'ab2', got {self.solver!r}")
+        for name in ("rounds", "views_at_once", "window", "memory_budget_bytes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
 
 
 def time_grid(steps: int, *, shift: float = 1.0) -> list[float]:
@@ -45,10 +87,10 @@ def integrate(
 
     Solvers, one evaluation a step each: ``euler``; ``ab2``, second-order Adams-Bashforth for uneven steps that starts with one Euler step.
     """
-    if solver not in ("euler", "ab2"):
+    if solver not in SOLVERS:
         raise ValueError(f"solver: expected 'euler' or 'ab2', got {solver!r}")
     previous, previous_step = None, 0.0
-    for index, (now, following) in enumerate(zip(times[:-1], times[1:], strict=True)):
+    for index, (now, following) in enumerate(pairwise(times)):
         step = following - now
         slope = field(state, now).float()
         if solver == "ab2" and previous is not None:
@@ -85,18 +127,25 @@ def evaluated_by(network: Callable[[Tensor, Tensor], Tensor], parts: list[Condit
     return predict
 
 
-def guided(predict: Predict, scale: Float[Tensor, "n 32 h w"]) -> VelocityField:
+def guided(predict: Predict, scale: Float[Tensor, "n 32 h w"], *, text_scale: float | None = None) -> VelocityField:
     """Classifier-free guidance v = u + scale (c - u) with a scale per latent; `predict` gives (u, c), or c alone (see `branches`).
 
+    With a `text_scale`, one more branch t comes last, c with a prompt, and text_scale (t - c) is added to the image's channels.
     The combination is in float32: a scale of 7 amplifies the rounding of the branches 13 times.
     """
 
     def field(state: Tensor, time: float) -> Tensor:
         velocities = predict(state, time, None).float()
-        if len(velocities) == 1:
-            return velocities[0]
-        unconditional, conditional = velocities
-        return unconditional + scale * (conditional - unconditional)
+        prompted = None
+        if text_scale is not None:
+            velocities, prompted = velocities[:-1], velocities[-1]
+        conditional = velocity = velocities[-1]
+        if len(velocities) == 2:
+            velocity = velocities[0] + scale * (conditional - velocities[0])
+        if prompted is not None and text_scale is not None:
+            image, rays = split(prompted - conditional)
+            velocity = velocity + text_scale * unsplit(image, torch.zeros_like(rays))
+        return velocity
 
     return field
 

@@ -5,6 +5,7 @@ narrower one without normalisation and with replicated borders, because a raymap
 Parameter names are those of the released checkpoints. Callers hold values in [0, 1]; that the network sees [-1, 1] is its own business.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -256,12 +257,17 @@ class VAE(nn.Module):
             mean = mean + (0.5 * logvar).exp() * noise
         return self.config.scaling * mean
 
-    def decode(self, latents: Float[Tensor, "n z h w"], clamp: bool = True) -> Float[Tensor, "n c 8*h 8*w"]:
-        """Pictures of scaled latents, in [0, 1], or unclamped for training's losses."""
+    def decode(
+        self, latents: Float[Tensor, "n z h w"], clamp: bool = True, decoder: Callable[[Tensor], Tensor] | None = None
+    ) -> Float[Tensor, "n c 8*h 8*w"]:
+        """Pictures of scaled latents, in [0, 1], or unclamped for training's losses.
+
+        `decoder` stands in for the whole decoder: a `TiledDecoder` of it, for large pictures.
+        """
         if latents.shape[1] != self.config.latent_channels:
             raise ValueError(f"latents: expected {self.config.latent_channels} channels, got {latents.shape[1]}.")
         z = (latents / self.config.scaling).to(self.dtype)
-        x01 = self.decoder(self.post_quant_conv(z)).to(latents.dtype) / 2 + 0.5
+        x01 = (decoder or self.decoder)(self.post_quant_conv(z)).to(latents.dtype) / 2 + 0.5
         return x01.clamp(0, 1) if clamp else x01
 
     @torch.no_grad()
