@@ -1,4 +1,4 @@
-"""The ``fillerbuster`` command: rooms, train, convert, demo, check.
+"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, check.
 
 Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
 """
@@ -111,6 +111,18 @@ def demo(
     run_demo(output, seed=seed, iterations=iterations, model=model)
 
 
+def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path("sheet.png")) -> None:
+    """Draw what a run of ns-train was given, what it generated, and what it renders, as one picture.
+
+    Args:
+        run: Folder of the run, which holds config.yml.
+        output: The picture.
+    """
+    from method_configs.sheet import write_sheet
+
+    write_sheet(run, output)
+
+
 def check(*, mend: bool = False) -> None:
     """Say what this machine lacks, in one sentence each.
 
@@ -122,7 +134,14 @@ def check(*, mend: bool = False) -> None:
     environment.check(mend=mend)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"rooms": rooms, "train": train, "convert": convert, "demo": demo, "check": check}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "rooms": rooms,
+    "train": train,
+    "convert": convert,
+    "demo": demo,
+    "sheet": sheet,
+    "check": check,
+}
 """Every subcommand by its name."""
 
 

@@ -1,0 +1,71 @@
+"""``fillerbuster sheet``: what a run was given, what it generated, and what its splats make of both, in one picture."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.evaluation.contact_sheet import Strip, evenly, write_contact_sheet
+from fb_core.evaluation.image_metrics import psnr
+from fb_nerfstudio.bridge import batch_image, to_nerfstudio
+from fb_nerfstudio.completed_views import ANCHOR, CompletedViews
+from method_configs.finished_run import load_run, quiet
+
+COLUMNS = 8
+_logger = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+@quiet()
+def write_sheet(run: Path, output: Path) -> None:
+    """Draw captured, generated and held-out views of a finished run, each above the run's render at the same camera.
+
+    Args:
+        run: folder of the run, which holds config.yml and checkpoints.
+        output: the picture's file; missing folders are made.
+
+    Raises ValueError when there is no finished run in the folder.
+    """
+    pipeline = load_run(run)
+    manager: Any = pipeline.datamanager
+    bank: CompletedViews | None = manager.generated_views
+    strips = _captured(pipeline, "Captured views", manager.cached_train, manager.train_dataset.cameras)
+    if bank is not None:
+        strips += _generated(pipeline, "Generated anchors", bank, [i for i, one in enumerate(bank.origins) if one.role == ANCHOR])
+        strips += _generated(pipeline, "Generated densified views", bank, [i for i, one in enumerate(bank.origins) if one.role != ANCHOR])
+    strips += _captured(pipeline, "Held-out views", manager.cached_eval, manager.eval_dataset.cameras)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    count = f"{len(manager.train_dataset)} captured and {0 if bank is None else len(bank)} generated views"
+    title, subtitle = f"{run.parent.parent.name}, {run.parent.name}", f"{count}, {pipeline.model.num_points} Gaussians"
+    write_contact_sheet(output, strips, title=title, subtitle=subtitle, columns=COLUMNS)
+    _logger.info("wrote %s", output)
+
+
+def _captured(pipeline: Any, heading: str, batches: Sequence[dict], cameras: Any) -> list[Strip]:
+    """Views of the capture and their renders. Pictures are cached undistorted, in the cameras' order."""
+    chosen = evenly(range(len(batches)), COLUMNS)
+    pictures = [batch_image(batches[index], "cpu") for index in chosen]
+    return _with_renders(pipeline, heading, len(batches), pictures, [cameras[index : index + 1] for index in chosen])
+
+
+def _generated(pipeline: Any, heading: str, bank: CompletedViews, indices: list[int]) -> list[Strip]:
+    chosen = evenly(indices, COLUMNS)
+    pictures = [bank.images[index].movedim(-1, 0).float() / 255 for index in chosen]
+    return _with_renders(pipeline, heading, len(indices), pictures, [to_nerfstudio(bank.cameras[index]) for index in chosen])
+
+
+def _with_renders(pipeline: Any, heading: str, total: int, pictures: list[Float[Tensor, "3 h w"]], cameras: list[Any]) -> list[Strip]:
+    """The pictures, and below them what the splats show there with its PSNR."""
+    renders, captions = [], []
+    for picture, camera in zip(pictures, cameras, strict=True):
+        render = pipeline.model.get_outputs_for_camera(camera.to(pipeline.device))["rgb"].cpu().movedim(-1, 0).clamp(0, 1)
+        renders.append(render)
+        captions.append(f"{float(psnr(render[None], picture[None])):.1f} dB")
+    shown = Strip(heading=f"{heading} ({len(pictures)} of {total})", pictures=pictures)
+    return [shown, Strip(heading="Rendered there", pictures=renders, captions=captions)]

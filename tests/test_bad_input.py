@@ -1,0 +1,184 @@
+"""Bad input at the level of ``ns-train fillerbuster``: one clear sentence, exit code not 0, nothing half written.
+
+The sentences are made in fb_core and tested there in detail (test_captures, test_media, test_checkpoint, test_inpainter);
+here each kind of damage goes through nerfstudio's own command.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+from safetensors.torch import load_file, save_file
+from tiny_models import save_tiny_model
+
+from fb_core.data import media
+from fb_nerfstudio.refusal import Refused
+from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
+from method_configs.splats import fillerbuster, fillerbuster_none
+
+
+class Started(Exception):
+    """The training would begin."""
+
+
+@pytest.fixture(autouse=True)
+def training_only_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is accepted gets as far as building the pipeline, and no further."""
+
+    def start(self, *_):
+        raise Started
+
+    monkeypatch.setattr(FillerbusterTrainer, "setup", start)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_tiny_model(tmp_path_factory.mktemp("good") / "model")
+
+
+def config_for(data: Path, model: Path | None, output: Path, method=fillerbuster) -> FillerbusterTrainerConfig:
+    config = copy.deepcopy(method.config)
+    config.data, config.output_dir, config.vis = data, output, "tensorboard"
+    config.machine.device_type = "cpu"
+    config.pipeline.datamanager.completion.model = model
+    return config
+
+
+def refusal(config: FillerbusterTrainerConfig) -> str:
+    """The sentence that ``ns-train`` ends with, checked for its form and for leaving nothing behind."""
+    with pytest.raises(SystemExit) as ended:
+        ns_train.main(config)
+    sentence = ended.value.code  # a text: Python prints it on stderr and exits with 1
+    assert isinstance(sentence, str) and isinstance(ended.value, ValueError) and isinstance(ended.value, Refused)
+    assert sentence and "\n" not in sentence and len(sentence) < 500
+    assert not config.output_dir.exists()
+    return sentence
+
+
+def edit(folder: Path, change: Callable[[dict], None]) -> None:
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def set_pose(value: float) -> Callable[[Path], None]:
+    """Every number of one camera's rotation becomes this."""
+
+    def change(content: dict) -> None:
+        for row in content["frames"][2]["transform_matrix"][:3]:
+            row[:3] = [value] * 3
+
+    return lambda folder: edit(folder, change)
+
+
+def cut(name: str, bytes_kept: int) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:bytes_kept])
+
+
+BAD_CAPTURES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no transforms.json": (lambda folder: (folder / "transforms.json").unlink(), r"no transforms\.json in this folder"),
+    "empty transforms.json": (lambda folder: (folder / "transforms.json").write_text(""), r"transforms\.json: the file is empty"),
+    "no JSON": (lambda folder: (folder / "transforms.json").write_text("frames: []"), r"transforms\.json: not a JSON file"),
+    "no cameras": (lambda folder: edit(folder, lambda content: content.update(frames=[])), "at least one camera, got no frames"),
+    "image missing": (lambda folder: (folder / "images" / "view_003.png").unlink(), r"view_003\.png: no such file"),
+    "image truncated": (cut("images/view_003.png", 200), r"view_003\.png: the file is truncated"),
+    "image of no bytes": (cut("images/view_003.png", 0), r"view_003\.png: the file is empty"),
+    "mask of another size": (
+        lambda folder: media.write_image(folder / "masks" / "view_001.png", torch.ones(1, 16, 24)),
+        r"mask .*view_001\.png: expected 48 x 32 pixels as its camera says, got 24 x 16",
+    ),
+    "singular pose": (set_pose(0.5), r"frame 2 .*pose .* is singular"),
+    "NaN pose": (set_pose(float("nan")), r"frame 2 .*pose .* holds NaN"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_CAPTURES)
+def test_a_bad_capture_is_refused(kind: str, tiny_capture: Path, model: Path, tmp_path: Path):
+    damage, expected = BAD_CAPTURES[kind]
+    damage(tiny_capture)
+    sentence = refusal(config_for(tiny_capture, model, tmp_path / "out"))
+    assert re.search(expected, sentence), sentence
+
+
+@pytest.mark.parametrize("method", [fillerbuster, fillerbuster_none], ids=lambda method: method.config.method_name)
+def test_a_folder_that_is_not_there_is_refused(method, model: Path, tmp_path: Path):
+    assert "no such folder" in refusal(config_for(tmp_path / "nowhere", model, tmp_path / "out", method))
+
+
+def misshape(folder: Path) -> None:
+    path = folder / "transformer.safetensors"
+    weights = load_file(path)
+    name = next(name for name, value in weights.items() if value.ndim == 2)
+    weights[name] = weights[name][:-1].contiguous()
+    save_file(weights, path)
+
+
+BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no config": (lambda folder: (folder / "config.json").unlink(), r"is not a model folder because it has no config\.json"),
+    "no weights": (lambda folder: (folder / "image-vae.safetensors").unlink(), r"is incomplete because it has no image-vae\.safetensors"),
+    "wrong shapes": (misshape, r"transformer\.safetensors"),
+    "truncated weights": (cut("transformer.safetensors", 5000), r"transformer\.safetensors: truncated"),
+    "weights of no bytes": (cut("raymap-vae.safetensors", 0), r"raymap-vae\.safetensors: truncated"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_MODELS)
+def test_a_bad_model_folder_is_refused(kind: str, tiny_capture: Path, tmp_path: Path):
+    damage, expected = BAD_MODELS[kind]
+    damage(save_tiny_model(tmp_path / "model"))
+    sentence = refusal(config_for(tiny_capture, tmp_path / "model", tmp_path / "out"))
+    assert re.search(expected, sentence), sentence
+
+
+def test_no_model_folder_is_refused_but_not_missed_without_completion(tiny_capture: Path, tmp_path: Path):
+    assert "no folder" in refusal(config_for(tiny_capture, tmp_path / "absent", tmp_path / "out"))
+    with pytest.raises(Started):
+        ns_train.main(config_for(tiny_capture, tmp_path / "absent", tmp_path / "out", fillerbuster_none))
+
+
+def test_no_checkpoint_to_go_on_from_is_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    config.load_dir = tmp_path / "nowhere"
+    assert "no checkpoint" in refusal(config)
+    config.load_dir, config.load_checkpoint = None, tmp_path / "nothing.ckpt"
+    assert "no such file" in refusal(config)
+
+
+def test_several_devices_are_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    config.machine.num_devices = 2
+    assert "trains in one process, got 2" in refusal(config)
+
+
+def test_what_is_good_starts(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    with pytest.raises(Started):
+        ns_train.main(config)
+    assert (config.get_base_dir() / "config.yml").is_file()
+
+
+def test_the_command_line_refuses_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    arguments = ["fillerbuster", "--data", str(tmp_path / "nowhere"), "--output-dir", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["ns-train", *arguments])
+    with pytest.raises(Refused, match="no such folder"):
+        ns_train.entrypoint()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_size_below_16_pixels_is_refused(tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    arguments = ["fillerbuster", "--data", str(tiny_capture), "--output-dir", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["ns-train", *arguments, "--pipeline.datamanager.completion.image-size", "8"])
+    with pytest.raises(SystemExit) as ended:
+        ns_train.entrypoint()
+    assert ended.value.code not in (0, None) and not (tmp_path / "out").exists()
+    said = capsys.readouterr()
+    assert "expected at least 16 pixels, got 8" in " ".join((said.out + said.err).replace("│", " ").split())
