@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,9 +14,7 @@ from fb_core.data.captures import read_capture
 from fb_core.evaluation.image_metrics import mean_quality, psnr
 from fb_nerfstudio.bridge import batch_image
 from fb_nerfstudio.completed_views import CompletedViews
-
-if TYPE_CHECKING:
-    from nerfstudio.pipelines.base_pipeline import Pipeline
+from method_configs.finished_run import load_run, quiet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,32 +47,15 @@ class HeldOutViews:
         }
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without nerfstudio's tables and messages, which would tear progress bars apart."""
-    from nerfstudio.utils.rich_utils import CONSOLE
-
-    before, CONSOLE.quiet = CONSOLE.quiet, True
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        CONSOLE.quiet = before
-
-
 @torch.no_grad()
-@_quiet()
+@quiet()
 def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], None] | None = None) -> HeldOutViews:
     """Load the run whose folder holds config.yml and render every held-out view of its capture.
 
     Raises ValueError when the run is not one of ours, has no held-out views, or when its capture does not say which are covered.
     """
-    from fb_nerfstudio.datamanager import FillerbusterDataManager
-
-    pipeline = _load(run)
+    pipeline = load_run(run)
     manager = pipeline.datamanager
-    if not isinstance(manager, FillerbusterDataManager):
-        raise ValueError(f"{run}: expected a run of fillerbuster or fillerbuster-none, got one with {type(manager).__name__}")
     views = manager.fixed_indices_eval_dataloader
     if len(views) == 0:
         raise ValueError(f"{run}: the run has no held-out views; make the capture with some")
@@ -98,12 +76,6 @@ def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], N
         covered=torch.tensor([verdicts[batch["image_idx"]] for _, batch in views]),
         generated=() if bank is None else tuple(_pictures(bank)),
     )
-
-
-def _load(run: Path) -> Pipeline:
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    return eval_setup(run / "config.yml", test_mode="test")[1].eval()
 
 
 def _verdicts(capture: Path, names: list[str]) -> list[bool]:
