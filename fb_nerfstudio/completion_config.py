@@ -62,8 +62,8 @@ class CompletionConfig:
     """Where the new cameras stand and look."""
     generated_share: float = 0.5
     """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn equally often."""
-    generated_pixels: Literal["all", "unseen"] = "all"
-    """Train on whole generated views, or only on their pixels that the capture has not seen."""
+    generated_pixels: Literal["all", "unseen"] = "unseen"
+    """Train only on the pixels of generated views that the capture has not seen, or on all (the paper); photographs know better."""
     view_weight: float = 1.0
     """Weight of a generated view's loss; captured views have 1."""
     seed_gaussians: bool = True

@@ -79,6 +79,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: CompletedViews | None = None
         self._bank_cameras: Cameras | None = None
+        self._bank_shares: list[float] = []  # of each generated view, the share of its pixels that is trained on
         self._finished = False
         self._captured_draws = 0
         self._epoch: tuple[int, list[int]] = (-1, [])
@@ -95,14 +96,16 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Probability that a step draws a generated view."""
         if self._bank is None:
             return 0.0
-        return min(self.config.completion.generated_share, len(self._bank) / (len(self._bank) + len(self.train_dataset)))
+        generated = sum(self._bank_shares)  # a view of which only a third is trained on counts as a third of a view
+        return min(self.config.completion.generated_share, generated / (generated + len(self.train_dataset)))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """A captured or a generated view, decided by the completion's seed and the step."""
         if self._bank is not None:
             draws = np.random.default_rng([self.config.completion.seed % 2**63, step])
             if draws.random() < self.generated_probability:
-                return self._generated_batch(int(draws.integers(len(self._bank))))
+                chances = np.array(self._bank_shares) / sum(self._bank_shares)
+                return self._generated_batch(int(draws.choice(len(self._bank), p=chances)))
         if self.config.train_cameras_sampling_strategy != "random":
             return super().next_train(step)
         _ = self.cached_train  # loads images on first use, and with them train_cameras
@@ -238,6 +241,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
     def _set_bank(self, views: CompletedViews | None) -> None:
         self._bank = views
         self._bank_cameras = None if views is None else to_nerfstudio(views.cameras, self.device)
+        self._bank_shares = [] if views is None else views.masks.double().mean(dim=(1, 2, 3)).tolist()
         self.completion_panel.show(views)
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -175,9 +175,22 @@ def test_float_caches_give_float_generated_images(tiny_capture: Path):
     assert images and images[0].dtype == torch.float32 and 0 <= float(images[0].min()) <= float(images[0].max()) <= 1
 
 
+def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(tiny_capture: Path):
+    manager = make(tiny_capture, options(generated_share=1.0))
+    generated(manager)
+    bank = manager.generated_views
+    masks = torch.zeros_like(bank.masks)
+    masks[0] = True
+    masks[1, : masks.shape[1] // 2] = True
+    manager._set_bank(dataclasses.replace(bank, masks=masks))
+    assert manager.generated_probability == pytest.approx(1.5 / (1.5 + 6))
+    covered = [float(batch["mask"].float().mean()) for camera, batch in map(manager.next_train, range(600)) if not camera.metadata]
+    assert set(covered) == {0.5, 1.0} and covered.count(1.0) > 1.3 * covered.count(0.5)
+
+
 @pytest.mark.parametrize(("share", "expected"), [(0.2, 0.2), (1.0, 6 / 12), (0.0, 0.0)])
 def test_generated_views_are_drawn_with_the_stated_probability(tiny_capture: Path, share: float, expected: float):
-    manager = make(tiny_capture, options(generated_share=share))
+    manager = make(tiny_capture, options(generated_share=share, generated_pixels="all"))
     generated(manager)
     assert manager.generated_probability == pytest.approx(expected)
     seen = draws(manager, range(400))
