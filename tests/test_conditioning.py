@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from fb_core.conditioning import SEQUENCE_CHANNELS, Conditioning, assemble, encode_known, encode_null, join, only_known, split, unsplit
 from fb_core.networks.vae import VAE, VAEConfig
 

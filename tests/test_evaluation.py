@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from tiny_models import tiny_model
+
 from fb_core.evaluation.completion import CompletionTask, evaluate_completion, mean_color, nearest_known, summary, unseen_room
 from fb_core.inpainter import SamplingConfig
-from tiny_models import tiny_model
 
 TASK = CompletionTask(rooms=2, views=4, known=2)
 QUICK = SamplingConfig(steps=2)

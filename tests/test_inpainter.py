@@ -4,10 +4,11 @@ import dataclasses
 
 import pytest
 import torch
+from tiny_models import tiny_model
+
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig, noise_of
 from fb_core.views import Views
-from tiny_models import tiny_model
 
 QUICK = SamplingConfig(steps=2, guidance_unknown=3.0)
 

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from fb_core.masks import drop_conditioning, grow_hole, partly_known, rotated_rectangle, to_latent_grid, training_mixture
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from fb_core.masks import drop_conditioning, grow_hole, partly_known, rotated_rectangle, to_latent_grid, training_mixture
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -1,13 +1,15 @@
 """Laws of the sampler: exact answers on solvable flows, guidance, and tiling that keeps everything attached to its views."""
 
+import itertools
 import math
 
 import pytest
 import torch
-from fb_core.conditioning import CONDITIONING_CHANNELS, Conditioning
-from fb_core.sampler import branches, evaluated_by, guidance_map, guided, integrate, tiled, time_grid, windows
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from fb_core.conditioning import CONDITIONING_CHANNELS, Conditioning
+from fb_core.sampler import branches, evaluated_by, guidance_map, guided, integrate, tiled, time_grid, windows
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -29,7 +31,7 @@ def per_view_network(sequence: torch.Tensor, time: torch.Tensor) -> torch.Tensor
 def test_time_grid_goes_from_one_to_zero(shift):
     times = time_grid(7, shift=shift)
     assert times[0] == 1.0 and times[-1] == 0.0 and len(times) == 8
-    assert all(later < earlier for earlier, later in zip(times[:-1], times[1:], strict=True))
+    assert all(later < earlier for earlier, later in itertools.pairwise(times))
 
 
 @pytest.mark.parametrize(("steps", "shift"), [(0, 1.0), (-3, 1.0), (4, 0.0)])

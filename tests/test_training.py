@@ -7,6 +7,7 @@ import json
 
 import pytest
 import torch
+
 from fb_core.data.sequences import PoolConfig, RoomPool, TaskConfig, draw_task
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
@@ -210,7 +211,7 @@ def test_linear_start_nearly_reproduces_raymaps():
 
 
 def test_linear_start_refuses_norms():
-    with pytest.raises(ValueError, match="without norms"):
+    with pytest.raises(ValueError, match="expected no norms"):
         start_linear(VAE(VAEConfig(**_SMALL_VAE | {"norm": "group", "norm_groups": 4})), seeded())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+
 from fb_core import checkpoint
 from fb_core.inpainter import Fillerbuster
 from fb_core.networks.dit import DiT, DiTConfig

@@ -64,8 +64,8 @@ class DiTStage:
 def encode_sequences(sequences: Sequences, *, image_vae: VAE, raymap_vae: VAE) -> tuple[Tensor, Conditioning]:
     """(clean latents [b, n, 32, h, w], conditioning) of a batch.
 
-    Latents that the pool kept are used. A view that is wholly known conditions with its clean latent, and all wholly unknown ones share one latent, so that only partly
-    known views are encoded twice.
+    Latents that the pool kept are used. A view that is wholly known conditions with its clean latent, and all wholly unknown ones
+    share one latent, so that only partly known views are encoded twice.
     """
     batch = sequences.images.shape[0]
     parts = []

@@ -25,7 +25,7 @@ def start_linear(network: VAE, generator: torch.Generator) -> VAE:
     config = network.config
     channels = config.in_channels
     if config.norm != "none" or min(*config.widths, config.latent_channels) < channels:
-        raise ValueError(f"linear start: expected an autoencoder without norms and with at least {channels} channels everywhere, got {config}")
+        raise ValueError(f"linear start: expected no norms and at least {channels} channels everywhere, got {config}")
     network.initialize(generator)
     average, smooth = torch.zeros(3, 3), torch.tensor([[1.0, 2.0, 1.0]]) / 4
     average[:2, :2] = 0.25

@@ -136,7 +136,8 @@ class Run:
         loss = losses["loss"]
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(
-                f"{self.stage.name}: the loss became {float(loss.detach())} at step {self.step}; the last good state is {self.folder / 'checkpoint.pt'}"
+                f"{self.stage.name}: the loss became {float(loss.detach())} at step {self.step}; "
+                f"the last good state is {self.folder / 'checkpoint.pt'}"
             )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
