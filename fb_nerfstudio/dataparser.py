@@ -1,4 +1,7 @@
-"""nerfstudio's own dataparser, reading the capture's point cloud without open3d (which needs a system library, libusb)."""
+"""nerfstudio's own dataparser without two of its obstacles.
+
+It reads the capture's point cloud without open3d, which needs a system library (libusb), and takes cameras that all stand in one place.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from torch import Tensor
 
+from fb_core.data.captures import read_capture
+
+_ONE_PLACE = 1e-6  # of the largest coordinate: what float32 cannot tell apart
+
 
 class NerfstudioWithoutOpen3d(Nerfstudio):
-    """Same outputs as its parent in every respect."""
+    """Same outputs as its parent, which cannot read captures whose cameras all stand in one place (one photo, a pure rotation)."""
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        centers = read_capture(self.config.data).poses[:, :, 3]
+        spread = float((centers - centers.mean(dim=0)).abs().max())
+        if spread <= _ONE_PLACE * (1.0 + float(centers.abs().max())):
+            self.config.auto_scale_poses = False  # the parent would divide by the spread
+        return super()._generate_dataparser_outputs(split)
 
     def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Tensor] | None:
         """Positions in the training world (float32 [n, 3]) and colours (uint8 [n, 3]; empty without any); None for no points."""

@@ -9,7 +9,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from fb_core import checkpoint
 from fb_core.data.captures import validate_capture
-from fb_core.inpainter import BUNDLED_MODEL
+from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
 from fb_nerfstudio.completion_config import CompletionConfig
 
 
@@ -22,13 +22,22 @@ class Refused(SystemExit, ValueError):
 
 
 def refuse_bad_capture(config: Any) -> None:
-    """Raises Refused when the data of a datamanager's config is a capture in nerfstudio's format that is broken."""
+    """Raises Refused when the data of a datamanager's config is a capture in nerfstudio's format that is broken, or too small."""
     if not isinstance(config.dataparser, NerfstudioDataParserConfig):
         return
     try:
-        validate_capture(Path(config.data or config.dataparser.data))
+        capture = validate_capture(Path(config.data or config.dataparser.data))
     except ValueError as error:
         raise Refused(str(error)) from None
+    scale = config.camera_res_scale_factor
+    for frame in capture.frames:
+        width, height = int(frame.camera.width * scale), int(frame.camera.height * scale)
+        if min(width, height) < SIDE_MULTIPLE:
+            scaled = "" if scale == 1 else f" after --pipeline.datamanager.camera-res-scale-factor {scale:g}"
+            raise Refused(
+                f"image {frame.image_path}: expected at least {SIDE_MULTIPLE} x {SIDE_MULTIPLE} pixels, got {width} x {height}{scaled}; "
+                "use larger pictures"
+            )
 
 
 def refuse_bad_model(config: CompletionConfig) -> None:

@@ -153,6 +153,12 @@ def test_no_checkpoint_to_go_on_from_is_refused(tiny_capture: Path, model: Path,
     assert "no such file" in refusal(config)
 
 
+def test_pictures_below_16_pixels_are_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    config.pipeline.datamanager.camera_res_scale_factor = 0.25
+    assert re.search(r"at least 16 x 16 pixels, got 12 x 8 after --pipeline\.datamanager\.camera-res-scale-factor 0\.25", refusal(config))
+
+
 def test_several_devices_are_refused(tiny_capture: Path, model: Path, tmp_path: Path):
     config = config_for(tiny_capture, model, tmp_path / "out")
     config.machine.num_devices = 2
