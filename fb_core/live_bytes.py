@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 
 class LiveBytes:
@@ -71,13 +70,22 @@ class _Counting(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs = kwargs or {}
-        self.live._known_before(tree_leaves((args, kwargs)))
-        made = func(*args, **kwargs)
-        self.live._made(tree_leaves(made), _convolution_scratch(*args[:2]) if func in _CONVOLUTIONS else 0)
+        self.live._known_before(_flat(args))
+        self.live._known_before(_flat(kwargs.values()))
+        shortcut = _SHORTCUTS.get(func) if isinstance(args[0] if args else None, Tensor) and args[0].is_meta else None
+        made = shortcut(*args) if shortcut else None
+        made = func(*args, **kwargs) if made is None else made
+        self.live._made(_flat((made,)), _convolution_scratch(*args[:2]) if func is _ATEN.convolution.default else 0)
         return made
 
 
-_CONVOLUTIONS = (torch.ops.aten.convolution.default,)
+def _flat(values: Iterable[Any]) -> Iterator[Any]:
+    """What stands in (nested) lists and tuples."""
+    for value in values:
+        if isinstance(value, list | tuple):
+            yield from _flat(value)
+        else:
+            yield value
 
 
 def _convolution_scratch(pixels: Tensor, weight: Tensor) -> int:
@@ -85,6 +93,30 @@ def _convolution_scratch(pixels: Tensor, weight: Tensor) -> int:
     if weight.element_size() >= 4:
         return pixels.numel() * pixels.element_size() + weight.numel() * weight.element_size()
     return pixels.numel() * pixels.element_size() * weight.shape[-1] * weight.shape[-2]
+
+
+def _convolved(x: Tensor, weight: Tensor, bias: Tensor | None, stride: list[int], padding: list[int], *_: Any) -> Tensor:
+    sides = [(x.shape[i + 2] + 2 * padding[i] - weight.shape[i + 2]) // stride[i] + 1 for i in (0, 1)]
+    return x.new_empty(x.shape[0], weight.shape[0], *sides)
+
+
+def _group_normed(x: Tensor, weight: Any, bias: Any, count: int, channels: int, places: int, groups: int, eps: float) -> tuple:
+    return torch.empty_like(x), x.new_empty(count, groups), x.new_empty(count, groups)
+
+
+def _pointwise(x: Tensor, *others: Any) -> Tensor | None:
+    """Like `x` for equal partners and plain numbers; broadcasting and mixed types are left to torch."""
+    alike = all(not isinstance(other, Tensor) or (other.shape == x.shape and other.dtype == x.dtype) for other in others)
+    return torch.empty_like(x) if alike and x.is_floating_point() else None
+
+
+_ATEN = torch.ops.aten
+_SHORTCUTS: dict[Any, Callable] = {
+    _ATEN.convolution.default: _convolved,
+    _ATEN.native_group_norm.default: _group_normed,
+    **dict.fromkeys((_ATEN.silu.default, _ATEN.add.Tensor, _ATEN.mul.Tensor, _ATEN.sub.Tensor, _ATEN.div.Tensor), _pointwise),
+}
+"""Shapes of what torch's own rules on the meta device take long to find."""
 
 
 class _FusedAttention(TorchFunctionMode):

@@ -1,4 +1,4 @@
-"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, check.
+"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, bench, check.
 
 Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
 """
@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+
+from method_configs.bench_command import Networks, Precision
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -123,6 +125,16 @@ def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path(
     write_sheet(run, output)
 
 
+def bench(
+    *,
+    benchmark: tyro.conf.OmitArgPrefixes[
+        Annotated[Networks, tyro.conf.subcommand("networks")] | Annotated[Precision, tyro.conf.subcommand("precision")]
+    ],
+) -> None:
+    """Measure time, memory and error on this machine."""
+    benchmark.run()
+
+
 def check(*, mend: bool = False) -> None:
     """Say what this machine lacks, in one sentence each.
 
@@ -140,6 +152,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "convert": convert,
     "demo": demo,
     "sheet": sheet,
+    "bench": bench,
     "check": check,
 }
 """Every subcommand by its name."""

@@ -1,0 +1,151 @@
+"""``fillerbuster bench``: its options; measures, shows a table, writes JSON and a figure. Heavy imports wait until it runs."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fb_core.evaluation.benchmarks import Report
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Networks:
+    """Sampling with our networks against the original's way of doing it: time, memory and difference."""
+
+    json: Path | None = None
+    """Write all measurements to this file."""
+    figure: Path | None = None
+    """Draw a chart into this file (png, svg or pdf)."""
+    quick: bool = False
+    """A miniature that shows that everything runs; its times mean nothing."""
+    seed: int = 0
+    """Decides weights and inputs."""
+
+    def run(self) -> None:
+        """Measure and report."""
+        import dataclasses
+
+        from fb_core.evaluation import benchmark_networks as benchmark
+
+        config = dataclasses.replace(benchmark.QUICK if self.quick else benchmark.NetworksBenchmark(), seed=self.seed)
+        report = benchmark.run_networks(config, on_cell=_say)
+        show(report, self.json, [] if self.figure is None else [lambda: _draw_networks(report, self.figure)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Precision:
+    """Whole samplings in bfloat16 against float32, over guidance scales and numbers of views."""
+
+    json: Path | None = None
+    """Write all measurements to this file."""
+    figure: Path | None = None
+    """Draw a chart into this file (png, svg or pdf)."""
+    quick: bool = False
+    """A miniature that shows that everything runs."""
+    model: Path | None = None
+    """Model folder; by default a tiny random model."""
+    seed: int = 0
+    """Decides weights and inputs."""
+
+    def run(self) -> None:
+        """Measure and report."""
+        import dataclasses
+
+        from fb_core.evaluation import benchmark_precision as benchmark
+        from fb_core.inpainter import Fillerbuster
+
+        config = dataclasses.replace(benchmark.QUICK if self.quick else benchmark.PrecisionBenchmark(), seed=self.seed)
+        model = None if self.model is None else Fillerbuster.from_pretrained(self.model)
+        report = benchmark.run_precision(config, model, on_cell=_say)
+        show(report, self.json, [] if self.figure is None else [lambda: _draw_precision(report, self.figure)])
+
+
+def show(report: Report, json: Path | None, drawings: list) -> None:
+    """Tables of the rows and bars on the terminal, then the files.."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for part in dict.fromkeys(row["part"] for row in report.rows):
+        rows = [row for row in report.rows if row["part"] == part]
+        table = Table(title=part)
+        columns = [name for name in rows[0] if name != "part"]
+        for name in columns:
+            table.add_column(name.replace("_", " "), justify="right")
+        for row in rows:
+            table.add_row(*(_told(row[name]) for name in columns))
+        console.print(table)
+    for bar in report.bars:
+        console.print(f"{'holds ' if bar.holds else 'MISSED'}  {bar.name}: {_told(bar.value)} (bar {bar.sense} {bar.limit:g})")
+    if json is not None:
+        _logger.info("wrote %s", report.write(json, command=_command()))
+    for draw in drawings:
+        draw()
+
+
+def _say(cell: str) -> None:
+    _logger.info("measuring %s", cell)
+
+
+def _told(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _command() -> str:
+    """What was typed, without the folder of the program."""
+    return " ".join(["fillerbuster", *sys.argv[1:]])
+
+
+def _draw_networks(report: Report, path: Path) -> None:
+    """Two bars per cell: the original's way and ours."""
+    rows = [row for row in report.rows if row["part"] == "sampling"]
+    labels = [f"{row['views']} views\nof {row['size']}" for row in rows]
+    figure, axes = _axes("seconds per sampling")
+    places = range(len(rows))
+    axes.bar([place - 0.2 for place in places], [row["sampling_plain_seconds"] for row in rows], 0.4, label="as the original does it")
+    axes.bar([place + 0.2 for place in places], [row["sampling_seconds"] for row in rows], 0.4, label="ours")
+    for place, row in zip(places, rows, strict=True):
+        axes.annotate(f"{row['sampling_ratio']:.2f}x", (place + 0.2, row["sampling_seconds"]), ha="center", va="bottom")
+    axes.set_xticks(list(places), labels)
+    axes.set_yscale("log")
+    axes.legend()
+    _save(figure, path)
+
+
+def _draw_precision(report: Report, path: Path) -> None:
+    """Mean error of the images over guidance, one line per number of views."""
+    figure, axes = _axes("mean error of generated pixels (range 0 to 1)")
+    for count in dict.fromkeys(row["views"] for row in report.rows):
+        rows = [row for row in report.rows if row["views"] == count]
+        axes.plot([row["guidance"] for row in rows], [row["image_mean_error"] for row in rows], marker="o", label=f"{count} views")
+    axes.set_xlabel("guidance scale of unknown content")
+    axes.set_yscale("log")
+    axes.legend()
+    _save(figure, path)
+
+
+def _axes(label: str) -> tuple[Any, Any]:
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(8, 4.5), layout="constrained")
+    axes.set_ylabel(label)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _save(figure: Any, path: Path) -> None:
+    from matplotlib import pyplot
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
+    _logger.info("wrote %s", path)
