@@ -264,5 +264,7 @@ def _summarize(metrics: dict[str, Any], output: Path) -> None:
     console.print(quality, promises)
     console.print(f"Pictures: {output / 'report.png'}\nNumbers:  {output / 'metrics.json'}", soft_wrap=True)
     console.print(
-        f"Look at the completed scene: ns-viewer --load-config {run_folder(output, METHODS['with']) / 'config.yml'}", soft_wrap=True
+        f"Look at the completed scene: ns-viewer --load-config {run_folder(output, METHODS['with']) / 'config.yml'} "
+        "--viewer.websocket-host 127.0.0.1",
+        soft_wrap=True,
     )
