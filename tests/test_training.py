@@ -36,6 +36,7 @@ TOY = Recipe(
     image_vae_loss=VAELossConfig(batch=2),
     raymap_vae_loss=VAELossConfig(batch=2),
     dit_loss=DiTLossConfig(batch=2, task=TaskConfig(views=4)),
+    sampling=SamplingConfig(guidance_unknown=2.0, steps=3),
 )
 
 
@@ -90,6 +91,7 @@ def test_exported_model_loads_and_completes_views(finished, tmp_path):
     folder, _ = finished
     export(TOY, folder, tmp_path / "model")
     model = Fillerbuster.from_pretrained(tmp_path / "model")
+    assert model.recommended_sampling == TOY.sampling
     assert model.size == 16 and model.info["preset"] == "toy" and len(model.info["training"]) == 3
     views = Views.unposed(torch.rand(2, 3, 16, 16, generator=seeded()))
     assert torch.isfinite(model.complete(views, generator=seeded(), sampling=SamplingConfig(steps=2)).raymaps).all()

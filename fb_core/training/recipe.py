@@ -17,6 +17,7 @@ from fb_core.conditioning import encode_in_chunks
 from fb_core.data.sequences import PoolConfig, RoomPool
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.sampler import SamplingConfig
 from fb_core.training.dit_stage import DiTLossConfig, DiTStage
 from fb_core.training.linear_start import start_linear
 from fb_core.training.loop import LoopConfig, OnProgress, Run
@@ -54,6 +55,8 @@ class Recipe:
     """Loss of the raymap autoencoder."""
     dit_loss: DiTLossConfig = DiTLossConfig()
     """Loss and task of the transformer."""
+    sampling: SamplingConfig = SamplingConfig()
+    """How the finished model samples best; its folder says so."""
     seed: int = 0
     """Decides rooms, weights and every draw."""
 
@@ -142,10 +145,17 @@ def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = t
         "image_size": recipe.pool.image_size,
         "views": recipe.dit_loss.task.views,
         "families": list(recipe.pool.families),
+        "sampling": _differences(recipe.sampling),
         "training": records,
     }
     checkpoint.save(output, dit=dit, image_vae=vaes["image-vae"], raymap_vae=vaes["raymap-vae"], info=info, dtype=dtype)
     _logger.info("wrote the model to %s", output)
+
+
+def _differences(sampling: SamplingConfig) -> dict:
+    """The options that are not the defaults."""
+    defaults = dataclasses.asdict(SamplingConfig())
+    return {name: value for name, value in dataclasses.asdict(sampling).items() if value != defaults[name]}
 
 
 def _load_average(network: nn.Module, folder: Path, preset: str, stage: str) -> dict:
