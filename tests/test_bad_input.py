@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from safetensors.torch import load_file, save_file
 from tiny_models import save_tiny_model
 
 from fb_core.data import media
+from fb_core.data.captures import FrameToWrite, write_capture
+from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
 from method_configs.splats import fillerbuster, fillerbuster_none
@@ -170,6 +173,22 @@ def test_what_is_good_starts(tiny_capture: Path, model: Path, tmp_path: Path):
     with pytest.raises(Started):
         ns_train.main(config)
     assert (config.get_base_dir() / "config.yml").is_file()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_one_photo_and_a_pure_rotation_are_good_input(count: int, tmp_path: Path):
+    """Cameras that all stand in one place: nerfstudio's own reader divides by their spread."""
+    center = torch.tensor([[0.3, 0.7, -0.1]])
+    looks = [torch.tensor([[math.cos(angle), math.sin(angle), 0.0]]) for angle in range(count)]
+    up = torch.tensor([0.0, 0.0, 1.0])
+    cameras = [Pinholes.looking_at(center, center + look, up=up, fov_degrees=60.0, width=32, height=24) for look in looks]
+    frames = [FrameToWrite(name=f"view_{i}", image=torch.rand(3, 24, 32), camera=camera) for i, camera in enumerate(cameras)]
+    write_capture(tmp_path / "capture", frames)
+    config = config_for(tmp_path / "capture", None, tmp_path / "out").pipeline.datamanager
+    config.data = tmp_path / "capture"
+    manager = config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    assert len(manager.train_dataset) == count
+    assert bool(manager.train_dataset.cameras.camera_to_worlds.isfinite().all())
 
 
 def test_the_command_line_refuses_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

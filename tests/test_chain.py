@@ -196,10 +196,11 @@ def test_tensorboard_has_a_log_with_losses_and_pictures(chain: Chain):
 # ---- commands on the finished run -----------------------------------------------------------------------------------
 
 
-def test_ns_eval(chain: Chain, tmp_path: Path):
+@pytest.mark.parametrize("run", ["killed", "resumed"])
+def test_ns_eval(chain: Chain, run: str, tmp_path: Path):
     from nerfstudio.scripts.eval import ComputePSNR
 
-    ComputePSNR(load_config=chain.config_file, output_path=tmp_path / "eval.json").main()
+    ComputePSNR(load_config=getattr(chain, run) / "config.yml", output_path=tmp_path / "eval.json").main()
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert results["psnr"] > 3 and 0 <= results["ssim"] <= 1
 
