@@ -33,7 +33,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         """Positions in the training world (float32 [n, 3]) and colours (uint8 [n, 3]; empty without any); None for no points."""
         import trimesh
 
-        cloud = trimesh.load(str(ply_file_path), process=False)
+        cloud: Any = trimesh.load(str(ply_file_path), process=False)
         if len(cloud.vertices) == 0:
             return None
         points = torch.from_numpy(np.array(cloud.vertices, dtype=np.float32))
