@@ -149,7 +149,7 @@ def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", 
     image_vae = without_weights(lambda: VAE(config.image_vae))
     raymap_vae = without_weights(lambda: VAE(config.raymap_vae))
     _load_weights(dit, folder / WEIGHT_FILES["transformer"], device, dtype)
-    _load_weights(image_vae, folder / WEIGHT_FILES["image_vae"], device, torch.float32 if dtype == torch.float16 else dtype)
+    _load_weights(image_vae, folder / WEIGHT_FILES["image_vae"], device, dtype and autoencoder_dtype(dtype))
     _load_weights(raymap_vae, folder / WEIGHT_FILES["raymap_vae"], device, torch.float32)
     prompt = folder / PROMPT_FILE
     embedding = _read_prompt(prompt, device) if prompt.exists() else None
@@ -218,6 +218,11 @@ def _require_precision(device: torch.device, dtype: torch.dtype) -> None:
         raise ValueError(f"dtype: expected a floating point type, got {dtype}.")
     if device.type == "cpu" and dtype == torch.float16:
         raise ValueError("dtype: float16 is not offered on the CPU, where it is slow and overflows; use bfloat16 or float32.")
+
+
+def autoencoder_dtype(dtype: torch.dtype) -> torch.dtype:
+    """Precision of the image autoencoder beside a transformer of `dtype`: activations of float16 would overflow, so it stays float32."""
+    return torch.float32 if dtype == torch.float16 else dtype
 
 
 def model_hash(folder: str | os.PathLike[str]) -> str:

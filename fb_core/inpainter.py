@@ -180,7 +180,7 @@ class Fillerbuster:
         free = None
         if sampling.memory_budget_bytes is None:
             free = available_bytes(self.device)
-            cut = uncut(views, size, self.dit.dtype, free, model=self.config, sampling=sampling, prompted=bool(prompt))
+            cut = uncut(views, size, free, model=self.config, sampling=sampling, prompted=bool(prompt))
             if cut is not None:
                 return cut
         expected = self.estimate(views, size, sampling, prompt=prompt)

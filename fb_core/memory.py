@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fb_core.checkpoint import ModelConfig
+from fb_core.checkpoint import ModelConfig, autoencoder_dtype
 from fb_core.conditioning import CONDITIONING_CHANNELS, LATENT_CHANNELS, STATE_CHANNELS, decode_in_chunks, encode_in_chunks
 from fb_core.live_bytes import LiveBytes
 from fb_core.networks.dit import DiT
@@ -107,7 +107,6 @@ def estimate(
 def uncut(
     views: int,
     size: tuple[int, int],
-    dtype: torch.dtype,
     free: int | None,
     *,
     model: ModelConfig,
@@ -119,7 +118,7 @@ def uncut(
     `estimate` takes seconds at its first call, which imports torch's shape rules; a demo of small views should not wait for them.
     """
     autoencoders, working = bound(views, size, model=model, sampling=sampling, prompted=prompted)
-    if dtype.itemsize < 4 or autoencoders > AUTOENCODER_BYTES or working > AUTOENCODER_BYTES or (free is not None and working > free):
+    if autoencoders > AUTOENCODER_BYTES or working > AUTOENCODER_BYTES or (free is not None and working > free):
         return None
     at_once = sampling.views_at_once or min(views, MOST_VIEWS_AT_ONCE)
     return Cut(views_encoded=at_once, views_decoded=at_once, tile=None, branches=_branch_count(sampling, prompted))
@@ -155,11 +154,6 @@ def available_bytes(device: torch.device) -> int | None:
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
     return None
-
-
-def autoencoder_dtype(dtype: torch.dtype) -> torch.dtype:
-    """Precision of the image autoencoder beside a transformer of `dtype`: activations of float16 would overflow, so it stays float32."""
-    return torch.float32 if dtype == torch.float16 else dtype
 
 
 def _padded(size: tuple[int, int]) -> tuple[int, int]:

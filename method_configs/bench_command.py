@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from fb_core.evaluation.benchmarks import Report
 
 _logger = logging.getLogger(__name__)
+_WIDEST_TABLE = 8
+_ALWAYS_SHOWN = ("views", "size", "steps", "parameters", "relative_difference")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,8 @@ def show(report: Report, json: Path | None, drawings: list) -> None:
         rows = [row for row in report.rows if row["part"] == part]
         table = Table(title=part)
         columns = [name for name in rows[0] if name != "part"]
+        if len(columns) > _WIDEST_TABLE:  # the file has them all
+            columns = [name for name in columns if "ratio" in name or name in _ALWAYS_SHOWN or name == "sampling_seconds"]
         for name in columns:
             table.add_column(name.replace("_", " "), justify="right")
         for row in rows:

@@ -245,6 +245,13 @@ def test_weights_with_unknown_missing_and_misshapen_keys(folder):
             load(folder)
 
 
+def test_beside_float16_the_autoencoders_stay_in_float32(folder, monkeypatch):
+    monkeypatch.setattr(checkpoint, "_require_precision", lambda device, dtype: None)  # as on a GPU
+    loaded = load(folder, dtype=torch.float16)
+    assert loaded.dit.dtype == torch.float16
+    assert loaded.image_vae.dtype == loaded.raymap_vae.dtype == torch.float32
+
+
 def test_precisions_that_cannot_be_computed(folder):
     with pytest.raises(ValueError, match="float16 is not offered on the CPU"):
         load(folder, dtype=torch.float16)
