@@ -12,7 +12,7 @@ import pytest
 from method_configs import commands
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ["README.md", "docs/quickstart.md", "docs/gpu.md"]
+PAGES = ["README.md", "docs/quickstart.md", "docs/gpu.md", "docs/weights.md", "docs/speed_and_accuracy.md"]
 
 
 def commands_of(page: str) -> list[str]:
