@@ -26,6 +26,12 @@ class Networks:
     """Draw a chart into this file (png, svg or pdf)."""
     quick: bool = False
     """A miniature that shows that everything runs; its times mean nothing."""
+    views: tuple[int, ...] = (8, 16, 40)
+    """Numbers of views of whole samplings."""
+    sizes: tuple[int, ...] = (128, 256)
+    """Their sides in pixels."""
+    full_size: bool = True
+    """Also time one step of the released architecture (takes 4 GB of memory)."""
     seed: int = 0
     """Decides weights and inputs."""
 
@@ -35,7 +41,12 @@ class Networks:
 
         from fb_core.evaluation import benchmark_networks as benchmark
 
-        config = dataclasses.replace(benchmark.QUICK if self.quick else benchmark.NetworksBenchmark(), seed=self.seed)
+        config = benchmark.QUICK
+        if not self.quick:
+            cells = tuple((views, size) for size in self.sizes for views in self.views)
+            config = dataclasses.replace(benchmark.NetworksBenchmark(), cells=cells)
+            config = config if self.full_size else dataclasses.replace(config, full_size=None)
+        config = dataclasses.replace(config, seed=self.seed)
         report = benchmark.run_networks(config, on_cell=_say)
         show(report, self.json, [] if self.figure is None else [lambda: _draw_networks(report, self.figure)])
 

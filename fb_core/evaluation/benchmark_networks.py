@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import statistics
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from fb_core.sampler import branches, evaluated_by, guidance_map, guided, integr
 
 WORDS = 77
 USUAL_STEPS = 24
+_PARTS = ("sampling", "encoding", "step", "decoding")
 _VAE = VAEConfig(widths=(8, 16, 16, 16), norm_groups=4, encoder_resnets=1, decoder_resnets=1)
 _RAYMAP_VAE = dataclasses.replace(_VAE, in_channels=6, norm="none", padding="replicate")
 SMALL = ModelConfig(transformer=DiTConfig(heads=2, head_dim=32, depth=2, text_width=64), image_vae=_VAE, raymap_vae=_RAYMAP_VAE)
@@ -34,7 +36,7 @@ class NetworksBenchmark:
 
     cells: tuple[tuple[int, int], ...] = ((8, 128), (16, 128), (40, 128), (8, 256), (16, 256), (40, 256))
     """(views, side in pixels) of whole samplings with the small model; half of the views are known."""
-    steps: int = 6
+    steps: int = 4
     """Denoising steps of these samplings."""
     runs: int = 3
     """Runs that medians are taken of."""
@@ -44,6 +46,13 @@ class NetworksBenchmark:
     """That architecture."""
     seed: int = 0
     """Decides weights and inputs."""
+
+    def __post_init__(self) -> None:
+        for views, size in self.cells:
+            if views < 1 or size < 16 or size % 16:
+                raise ValueError(f"cells: expected at least one view of a multiple of 16 pixels, got {views} of {size}")
+        if not self.cells or self.steps < 1 or self.runs < 1:
+            raise ValueError(f"benchmark: expected at least one cell, step and run, got {len(self.cells)}, {self.steps}, {self.runs}")
 
 
 QUICK = NetworksBenchmark(
@@ -139,6 +148,7 @@ def run_networks(config: NetworksBenchmark = NetworksBenchmark(), *, on_cell: On
     """Measure everything; takes minutes with the default, seconds with `QUICK`."""
     report = Report(seed=config.seed)
     small = random_model(SMALL, config.seed)
+    _cell(small, 2, 32, 1, config.seed).sample_plain()  # what torch sets up at first use
     for views, size in config.cells:
         on_cell(f"{views} views of {size}")
         report.rows.append(_sampling_row(_cell(small, views, size, config.steps, config.seed), config.runs))
@@ -158,32 +168,39 @@ def run_networks(config: NetworksBenchmark = NetworksBenchmark(), *, on_cell: On
     return report
 
 
-def _measured(part: str, cell: _Cell, plain: Callable[[], Any], ours: Callable[[], Any], runs: int) -> dict[str, Any]:
-    seconds = median_seconds({"plain": plain, "ours": ours}, runs, warm_up=len(cell.images) <= 16)
-    return {
-        f"{part}_plain_seconds": seconds["plain"],
-        f"{part}_seconds": seconds["ours"],
-        f"{part}_ratio": seconds["plain"] / seconds["ours"],
-    }
-
-
 def _sampling_row(cell: _Cell, runs: int) -> dict[str, Any]:
-    """A whole sampling and its parts, both ways; times at 24 steps are put together from the parts."""
+    """A whole sampling both ways, run in turn: medians of the whole and of its parts; times at 24 steps are put together from parts."""
     views, _, size, _ = cell.images.shape
     steps = len(cell.times) - 1
+    ways = {
+        "_plain": (cell.encode_plain, cell.denoise_plain, len(cell.images)),
+        "": (cell.encode, cell.denoise, 16),
+    }
+    times: dict[str, dict[str, list[float]]] = {way: {part: [] for part in _PARTS} for way in ways}
+    latents: dict[str, Tensor] = {}
+    for _ in range(runs):
+        for way, (encode, denoise, views_at_once) in ways.items():
+            marks = [time.perf_counter()]
+            null, known = encode()
+            marks.append(time.perf_counter())
+            latents[way] = denoise(null, known)
+            marks.append(time.perf_counter())
+            cell.decode(latents[way], views_at_once)
+            marks.append(time.perf_counter())
+            taken = (marks[3] - marks[0], marks[1] - marks[0], (marks[2] - marks[1]) / steps, marks[3] - marks[2])
+            for part, seconds in zip(_PARTS, taken, strict=True):
+                times[way][part].append(seconds)
     row: dict[str, Any] = {"part": "sampling", "views": views, "size": size, "steps": steps}
-    row |= _measured("sampling", cell, cell.sample_plain, cell.sample, runs)
-    row |= _measured("encoding", cell, cell.encode_plain, cell.encode, runs)
-    null, known = cell.encode()
-    row |= _measured("step", cell, lambda: cell.denoise_plain(null, known, 1), lambda: cell.denoise(null, known, 1), runs)
-    decoding = median_seconds({"decoding": lambda: cell.decode(cell.noise, 16)}, 1)["decoding"]
-    plain, ours = (row[f"encoding{kind}"] + USUAL_STEPS * row[f"step{kind}"] + decoding for kind in ("_plain_seconds", "_seconds"))
-    row |= {"decoding_seconds": decoding, f"ratio_at_{USUAL_STEPS}_steps_from_parts": plain / ours}
-    wanted, got = cell.denoise_plain(*cell.encode_plain()), cell.denoise(null, known)
-    row["relative_difference"] = relative_difference(got, wanted)
+    median = {way: {part: statistics.median(values) for part, values in parts.items()} for way, parts in times.items()}
+    for part in _PARTS:
+        row |= {f"{part}{way}_seconds": median[way][part] for way in ways}
+        row[f"{part}_ratio"] = median["_plain"][part] / median[""][part]
+    usual = [parts["encoding"] + USUAL_STEPS * parts["step"] + parts["decoding"] for parts in median.values()]
+    row[f"ratio_at_{USUAL_STEPS}_steps_from_parts"] = usual[0] / usual[1]
+    row["relative_difference"] = relative_difference(latents[""], latents["_plain"])
     for name, job in (("plain_peak_bytes", cell.sample_plain), ("peak_bytes", cell.sample)):
         with LiveBytes() as live:
-            job(2)
+            job(1)
         row[name] = live.peak
     return row
 
@@ -191,7 +208,7 @@ def _sampling_row(cell: _Cell, runs: int) -> dict[str, Any]:
 def _saving_rows(cell: _Cell, runs: int) -> list[dict[str, Any]]:
     """One step's time as the savings are made one after the other, each with its difference from the plain step."""
     null, known = cell.encode()
-    scale, dit, time = _scale(known), cell.model.dit, cell.times[0]
+    scale, dit, now = _scale(known), cell.model.dit, cell.times[0]
 
     def network(sequences: Tensor, times: Tensor) -> Tensor:
         return dit(sequences, times, cell.text.expand(len(sequences), -1, -1))
@@ -202,10 +219,10 @@ def _saving_rows(cell: _Cell, runs: int) -> list[dict[str, Any]]:
     channels = torch.stack([null.channels, known.channels])
     prepared = Prepared(dit, channels, cell.times[:-1], text=cell.text)
     variants = {
-        "three passes": lambda: plain_step(dit, cell.noise, time, null, known, cell.text, scale),
-        "no third pass for equal text": lambda: guided(one_by_one, scale)(cell.noise, time),
-        "branches in one batch": lambda: guided(evaluated_by(network, [null, known]), scale)(cell.noise, time),
-        "constants computed once": lambda: guided(prepared, scale)(cell.noise, time),
+        "three passes": lambda: plain_step(dit, cell.noise, now, null, known, cell.text, scale),
+        "no third pass for equal text": lambda: guided(one_by_one, scale)(cell.noise, now),
+        "branches in one batch": lambda: guided(evaluated_by(network, [null, known]), scale)(cell.noise, now),
+        "constants computed once": lambda: guided(prepared, scale)(cell.noise, now),
     }
     seconds, wanted = median_seconds(variants, max(runs, 2 * runs - 1)), variants["three passes"]()
     rows, before = [], seconds["three passes"]
@@ -247,15 +264,15 @@ def _floor_row(cell: _Cell, runs: int) -> dict[str, Any]:
 def _full_size_row(cell: _Cell, runs: int) -> dict[str, Any]:
     """One step of the released architecture, without the preparation, whose time stands beside it."""
     null, known = cell.encode()
-    scale, dit, time = _scale(known), cell.model.dit, cell.times[0]
+    scale, dit, now = _scale(known), cell.model.dit, cell.times[0]
     channels = torch.stack([null.channels, known.channels])
     prepared = Prepared(dit, channels, cell.times[:-1], text=cell.text)
     jobs = {
-        "plain": lambda: plain_step(dit, cell.noise, time, null, known, cell.text, scale),
-        "ours": lambda: guided(prepared, scale)(cell.noise, time),
+        "plain": lambda: plain_step(dit, cell.noise, now, null, known, cell.text, scale),
+        "ours": lambda: guided(prepared, scale)(cell.noise, now),
         "preparation": lambda: Prepared(dit, channels, cell.times[:-1], text=cell.text),
     }
-    seconds = median_seconds(jobs, runs)
+    seconds = median_seconds(jobs, runs, warm_up=False)
     row: dict[str, Any] = {
         "part": "full-size step", "views": len(cell.noise), "size": cell.images.shape[-1],
         "parameters": sum(parameter.numel() for parameter in dit.parameters()),
