@@ -79,3 +79,9 @@ def test_precision_in_miniature(tmp_path, monkeypatch):
     (row,) = content["rows"]
     assert row["finite"] and 0 < row["image_mean_error"] < 0.1 and content["bars"][0]["holds"]
     assert (tmp_path / "p.png").exists()
+
+
+@pytest.mark.parametrize("nonsense", [{"cells": ()}, {"cells": ((0, 16),)}, {"cells": ((4, 20),)}, {"steps": 0}, {"runs": 0}])
+def test_nonsense_is_refused(nonsense):
+    with pytest.raises(ValueError, match="expected at least one"):
+        NetworksBenchmark(**nonsense)
