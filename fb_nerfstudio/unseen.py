@@ -25,10 +25,11 @@ from fb_nerfstudio.completed_views import CompletedViews
 
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
+_FIRM = 0.9  # accumulation from which splats beside the captured pictures are believed
+_BESIDE = 0.25  # how far beside, as a part of the picture's side
 TRAINED_STEPS = 100
 """Steps after which the splats' own depth and accumulation are believed."""
 _SIDE = 64  # pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures
-_BORDER_SHARE = 1 / 32  # unseen regions grow by this part of the picture, so that old and new overlap at the seam
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +88,8 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
 def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shell, rendered: Rendered | None) -> Unseen:
     """Which pixels of generated views show what the capture has not.
 
-    A pixel is seen when its surface point falls into a captured picture and, if ``rendered`` tells, splats cover it. The
+    A pixel is seen when its surface point falls into a captured picture and, if ``rendered`` tells, splats cover it. Just beside the
+    captured pictures firm splats are believed too: they continue what was captured better than a generated picture would. The
     surface point is the splats' where they cover the pixel and the shell's elsewhere.
 
     Args:
@@ -106,15 +108,24 @@ def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shel
         covered = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
         surface = torch.where(covered[..., None], cameras.unproject(rendered.depth), points)
     flat = surface.reshape(-1, 3)
-    inside = seen_by([camera.to("cpu", torch.float32) for camera in captured], torch.nan_to_num(flat, posinf=1e9, neginf=-1e9))
-    return Unseen(mask=~(covered & inside.reshape(covered.shape)), points=points)
+    finite = torch.nan_to_num(flat, posinf=1e9, neginf=-1e9)
+    nearby = [camera.to("cpu", torch.float32) for camera in captured]
+    inside = seen_by(nearby, finite).reshape(covered.shape)
+    if rendered is not None:
+        beside = seen_by([_widened(camera) for camera in nearby], finite).reshape(covered.shape)
+        inside |= beside & (rendered.accumulation >= _FIRM)
+    return Unseen(mask=~(covered & inside), points=points)
+
+
+def _widened(camera: Pinholes) -> Pinholes:
+    """The same camera with a picture that shows more to all sides."""
+    x, y = round(camera.width * _BESIDE), round(camera.height * _BESIDE)
+    return camera.cropped(-x, -y, camera.width + 2 * x, camera.height + 2 * y)
 
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
-    """The views with masks that leave only their unseen pixels and a narrow seam around them."""
-    reach = max(1, round(unseen.mask.shape[1] * _BORDER_SHARE))
-    grown = F.max_pool2d(unseen.mask[:, None].float(), 2 * reach + 1, stride=1, padding=reach)
-    masks = F.interpolate(grown, size=views.images.shape[1:3], mode="nearest") > 0
+    """The views with masks that leave only their unseen pixels. No seam: generated pixels would blur what was captured."""
+    masks = F.interpolate(unseen.mask[:, None].float(), size=views.images.shape[1:3], mode="nearest") > 0
     return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1"))
 
 

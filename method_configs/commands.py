@@ -1,4 +1,4 @@
-"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, bench, check.
+"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, bench, eval, check.
 
 Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -135,6 +137,38 @@ def bench(
     benchmark.run()
 
 
+def evaluate(
+    *,
+    model: Path | None = None,
+    rooms: int = 20,
+    views: int = 16,
+    known: int = 8,
+    family: Literal["narrow", "medium", "wide"] = "narrow",
+    guidance: tuple[float, ...] = (),
+    seed: int = 0,
+    json: Path | None = None,
+    sheet: Path | None = None,
+) -> None:
+    """Complete unseen rooms and compare with the nearest known view and with the mean colour.
+
+    Args:
+        model: Model folder; by default the bundled one.
+        rooms: Unseen rooms.
+        views: Views per room.
+        known: How many of them the model is given.
+        family: How varied room and cameras are; the bundled model knows narrow rooms.
+        guidance: Guidance scales of unknown content to try; by default the model's own.
+        seed: Decides rooms, cameras and samples.
+        json: Write all measurements to this file.
+        sheet: Draw the first rooms into this PNG.
+    """
+    from method_configs import evaluation_command
+
+    evaluation_command.evaluate(
+        model=model, rooms=rooms, views=views, known=known, family=family, guidance=guidance, seed=seed, json=json, sheet=sheet
+    )
+
+
 def check(*, mend: bool = False) -> None:
     """Say what this machine lacks, in one sentence each.
 
@@ -153,6 +187,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "sheet": sheet,
     "bench": bench,
+    "eval": evaluate,
     "check": check,
 }
 """Every subcommand by its name."""
@@ -161,6 +196,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """The console script. An error that a user can mend is one sentence on stderr and a non-zero exit code."""
     _show_log()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that children are ended on the way out
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

@@ -94,7 +94,9 @@ def training_arguments(output: Path, method: str, *, seed: int, iterations: int,
         "pipeline.model.max-gaussians": 20000,
     }
     if method == METHODS["with"]:
-        completion = {"seed": seed, "densify-rounds": ROUNDS - 1} | ({} if model is None else {"model": model.absolute()})
+        completion = {"seed": seed, "densify-rounds": ROUNDS - 1, "at-step": iterations // 3} | (
+            {} if model is None else {"model": model.absolute()}
+        )
         shared |= {f"pipeline.datamanager.completion.{name}": value for name, value in completion.items()}
     return [method, *(text for name, value in shared.items() for text in (f"--{name}", str(value)))]
 

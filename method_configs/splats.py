@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManagerConfig
 from fb_nerfstudio.fused_adam import FusedAdamOptimizerConfig
 from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
@@ -76,7 +77,10 @@ def _trainer() -> TrainerConfig:
         mixed_precision=False,
         pipeline=VanillaPipelineConfig(
             datamanager=FillerbusterDataManagerConfig(
-                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True),
+                cache_images_type="uint8",
+                # Splats of some hundred steps tell what is seen better than the cameras alone; captured views stay in the majority.
+                completion=CompletionConfig(at_step=500, generated_share=0.3),
             ),
             model=_model(),
         ),

@@ -85,6 +85,7 @@ def toy_config(data: Path, output: Path, model: Path, timestamp: str) -> Fillerb
     manager.completion = dataclasses.replace(
         manager.completion,
         model=model,
+        at_step=0,
         anchor_views=ANCHORS,
         densify_rounds=1,
         densify_views=DENSIFIED,

@@ -444,8 +444,8 @@ def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at()
         views, [captured], sphere(torch.zeros(3), 3.0), Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=accumulation)
     )
     assert not unseen.mask[0, :, :4].any() and unseen.mask[0, :, 4:].all() and unseen.mask[1].all()
-    grown = with_unseen_masks(views, unseen)
-    assert grown.masks[0, :, 3].all() and not grown.masks[0, :, :3].any()
+    masked = with_unseen_masks(views, unseen)
+    assert masked.masks[0, :, 4:].all() and not masked.masks[0, :, :4].any()
 
 
 # ---- viewer ---------------------------------------------------------------------------------------------------------
