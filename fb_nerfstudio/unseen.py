@@ -25,8 +25,8 @@ from fb_nerfstudio.completed_views import CompletedViews
 
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
-_FIRM = 0.9  # accumulation from which splats beside the captured pictures are believed
-_BESIDE = 0.25  # how far beside, as a part of the picture's side
+_FIRM = 0.75  # accumulation from which splats beside the captured pictures are believed
+_BESIDE = 0.5  # how far beside, as a part of the picture's side
 TRAINED_STEPS = 100
 """Steps after which the splats' own depth and accumulation are believed."""
 _SIDE = 64  # pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures

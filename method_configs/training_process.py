@@ -89,14 +89,15 @@ class TrainingProcess:
 
     def _follow(self, text: str) -> None:
         """Report the latest progress that ``text`` tells of."""
-        if (step := _last(_TRAINING_STEP, text)) is not None:
-            self._report("train", min(int(step[1]) + 1, self._iterations), self._iterations)
-        elif (step := _last(_DENOISING_STEP, text)) is not None:
+        trained, denoised = _last(_TRAINING_STEP, text), _last(_DENOISING_STEP, text)
+        if denoised is not None and (trained is None or denoised.end() > trained.end()):
             now = time.monotonic()
             self._generating_since = self._generating_since or now
             self.seconds["generate"] = now - self._generating_since
-            done, total = int(step[2]), int(step[3])
-            self._report("generate", int(step[1] or 0) * total + done, self._rounds * total)
+            done, total = int(denoised[2]), int(denoised[3])
+            self._report("generate", int(denoised[1] or 0) * total + done, self._rounds * total)
+        elif trained is not None:
+            self._report("train", min(int(trained[1]) + 1, self._iterations), self._iterations)
 
 
 def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:

@@ -45,7 +45,15 @@ def start(tmp_path: Path, reports: list) -> TrainingProcess:
     return TrainingProcess(["fillerbuster"], log=tmp_path / "log", iterations=200, rounds=4, threads=1, report=report)
 
 
-@pytest.mark.parametrize(("text", "expected"), [(GENERATION, ("generate", 27, 96)), (STEPS, ("train", 200, 200))])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (GENERATION, ("generate", 27, 96)),
+        (STEPS, ("train", 200, 200)),
+        (STEPS + GENERATION, ("generate", 27, 96)),  # views may be generated in the middle of a training
+        (GENERATION + STEPS, ("train", 200, 200)),
+    ],
+)
 def test_progress_is_read_from_what_ns_train_prints(text, expected, pretend_ns_train, tmp_path):
     pretend_ns_train(text)
     reports: list = []
