@@ -240,7 +240,19 @@ def test_check_runs():
 def test_eval_in_miniature(tmp_path):
     from tiny_models import save_tiny_model
 
-    arguments = ["--model", str(save_tiny_model(tmp_path / "model")), "--rooms", "1", "--views", "3", "--known", "2", "--guidance", "1", "2"]
+    arguments = [
+        "--model",
+        str(save_tiny_model(tmp_path / "model")),
+        "--rooms",
+        "1",
+        "--views",
+        "3",
+        "--known",
+        "2",
+        "--guidance",
+        "1",
+        "2",
+    ]
     commands.main(["eval", *arguments, "--json", str(tmp_path / "eval.json"), "--sheet", str(tmp_path / "sheet.png")])
     rows = json.loads((tmp_path / "eval.json").read_text())["rows"]
     assert [row["method"] for row in rows] == ["model", "nearest", "mean"] * 2 and [row["guidance"] for row in rows[::3]] == [1.0, 2.0]
