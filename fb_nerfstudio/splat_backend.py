@@ -58,8 +58,8 @@ def render_splats(
     Both backends take any number of channels (normals are drawn as three more), antialiasing and absgrad. On Apple's mps the
     picture is computed on the CPU, said once, and comes back to mps together with what the strategies read.
     """
-    splats = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
-    options = dict(
+    splats: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
+    options: dict[str, Any] = dict(
         width=width,
         height=height,
         near_plane=near_plane,
