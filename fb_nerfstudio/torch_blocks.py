@@ -29,7 +29,7 @@ from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses
 from fb_nerfstudio.torch_projection import ALPHA_MIN
 
 TRANSMITTANCE_MIN = 1e-4
-TERMS, COLUMNS = 6, 11
+TERMS, GEOMETRY, COLUMNS = 6, 6, 11
 # Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels, deeper where there are fewer cells.
 PAIRS_PER_BLOCK = 2**18
 _SHALLOWEST = 16
@@ -43,10 +43,12 @@ class Table:
     """What a block needs to know, one row for each chosen Gaussian (one gather fetches all of it)."""
 
     rows: Float[Tensor, "v r"]
-    """log2(opacity), two blanks, -A/2, -B, -C/2, x, y, A, B, C, the values, 1; conic entries times log2(e); then padding."""
+    """log2(opacity), x, y, A, B, C (conic entries times log2(e)), the values, 1; then padding. A line of the cache where d is small."""
     channels: int
     """Values and the 1."""
     monomials: Float[Tensor, "6 p"]
+    halves: Float[Tensor, "3 1"]
+    """-1/2, -1, -1/2: what makes k3, k4, k5 of A, B, C."""
     centers: Float[Tensor, "2 cells"]
     alpha_threshold: float
     """The largest number below 1/255."""
@@ -62,6 +64,8 @@ class Block:
     """Rows of the table; padding points at some row and has alpha 0."""
     columns: Float[Tensor, "11 bs"]
     """Coefficients k0 .. k5, dx and dy (mean less cell centre), A, B, C: to the base 2 like the table."""
+    clear: Float[Tensor, "b s p"]
+    """1 - alpha before the stop."""
     values: Float[Tensor, "b s d1"]
     """Channels, and a last one of ones, which composites to alpha."""
     alpha: Float[Tensor, "b s p"]
@@ -104,14 +108,11 @@ def _monomials(size: int, like: Tensor) -> Float[Tensor, "6 p"]:
 
 def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> Table:
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
-    used = COLUMNS + values.shape[1] + 1
+    used = GEOMETRY + values.shape[1] + 1
     rows = values.new_empty(values.shape[0], padded(used))
     A, B, C = (column * math.log2(math.e) for column in (ellipses.A, ellipses.B, ellipses.C))
-    blank = torch.zeros_like(A)
-    torch.stack(
-        [ellipses.opacity.log2(), blank, blank, -0.5 * A, -B, -0.5 * C, ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :COLUMNS]
-    )
-    rows[:, COLUMNS : used - 1] = values
+    torch.stack([ellipses.opacity.log2(), ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :GEOMETRY])
+    rows[:, GEOMETRY : used - 1] = values
     rows[:, used - 1 :] = 1.0
     # A little slack: the polynomial may round an exponent to slightly above log(opacity).
     may_cap = values.shape[0] > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
@@ -119,6 +120,7 @@ def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> 
         rows=rows,
         channels=values.shape[1] + 1,
         monomials=_monomials(grid.size, values),
+        halves=values.new_tensor([[-0.5], [-1.0], [-0.5]]),
         centers=torch.stack(grid.centers(values)),
         alpha_threshold=float(below),
         cap=cap if may_cap else None,
@@ -132,6 +134,7 @@ class Stretch:
         self.cells, self.rest = cells, None
         """`rest`: after `blocks`, the stretch of the cells that still need work, or None."""
         self._counts, self._starts, self._rank = counts, starts, rank
+        self._ranks = torch.arange(int(counts[0]), dtype=torch.int32, device=counts.device)[:, None]
 
     def blocks(self, table: Table, listed: Tensor, transmittance: Tensor, scratch: Scratch, budget: int) -> Iterator[Block]:
         """The blocks in order, covering the first cells of the stretch; at the end their transmittance [cells, p] is up to date."""
@@ -148,7 +151,7 @@ class Stretch:
             rank += depth
             opaque = float(after[-1].min()) <= TRANSMITTANCE_MIN
             if opaque:
-                _stop(block.alpha, after)
+                _stop(block.alpha, after, scratch)
             yield block
             if opaque and rank < deepest:
                 still = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
@@ -161,7 +164,7 @@ class Stretch:
 
     def _pick(self, listed: Tensor, rank: int, depth: int, width: int, full: bool) -> tuple[Tensor, Tensor | None]:
         """Table rows of the ranks rank .. rank + depth of the first `width` cells, and what of it is padding."""
-        ranks = torch.arange(rank, rank + depth, dtype=torch.int32, device=listed.device)[:, None]
+        ranks = self._ranks[rank : rank + depth]
         positions = ranks + self._starts[:width]
         padding = None if full else ranks >= self._counts[:width]
         if padding is not None:
@@ -174,12 +177,14 @@ def _block(
 ) -> tuple[Block, Tensor]:
     """Evaluate all pairs; also returns the transmittance behind each [b, s, p]."""
     width, pixels = light.shape
-    rows = table.rows.index_select(0, splats)
-    k = scratch.take("columns", COLUMNS, depth * width).copy_(rows[:, :COLUMNS].t())
+    rows = torch.index_select(table.rows, 0, splats, out=scratch.take("rows", depth * width, table.rows.shape[1]))
+    k = scratch.take("columns", COLUMNS, depth * width)
+    k[COLUMNS - GEOMETRY :].copy_(rows[:, :GEOMETRY].t())
     k[6:8].view(2, depth, width).sub_(centers)
     dx, dy = k[6], k[7]
     torch.mul(k[8:10], dx, out=k[1:3]).addcmul_(k[9:11], dy)
-    k[0].addcmul_(dx, k[1], value=-0.5).addcmul_(dy, k[2], value=-0.5)
+    torch.addcmul(k[5], dx, k[1], value=-0.5, out=k[0]).addcmul_(dy, k[2], value=-0.5)
+    torch.mul(k[8:11], table.halves, out=k[3:6])
     if padding is not None:
         k[0].masked_fill_(padding.view(-1), _NEVER)
     alpha = torch.mm(k[:TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
@@ -191,24 +196,26 @@ def _block(
         alpha.clamp_(max=table.cap)
     lights = scratch.take("light", depth + 1, width, pixels)
     lights[0] = light
-    _darken(alpha, lights)
-    values = rows[:, COLUMNS : COLUMNS + table.channels].view(depth, width, -1)
-    return Block(splats=splats, columns=k, values=values, alpha=alpha, light=lights[:depth], capped=capped), lights[1:]
+    clear = torch.sub(1.0, alpha, out=scratch.take("clear", depth, width, pixels))
+    _darken(clear, lights)
+    values = rows[:, GEOMETRY : GEOMETRY + table.channels].view(depth, width, -1)
+    return Block(splats=splats, columns=k, values=values, alpha=alpha, clear=clear, light=lights[:depth], capped=capped), lights[1:]
 
 
-def _darken(alpha: Tensor, lights: Tensor) -> None:
-    """lights[b + 1] = lights[b] (1 - alpha[b]), in place."""
-    torch.sub(1.0, alpha, out=lights[1:])
-    if alpha[0].numel() < THIN:
+def _darken(clear: Tensor, lights: Tensor) -> None:
+    """lights[b + 1] = lights[b] clear[b]."""
+    if clear[0].numel() < THIN:
+        lights[1:] = clear
         torch.cumprod(lights, dim=0, out=lights)
         return
-    for before, after in pairwise(lights.unbind(0)):
-        after.mul_(before)
+    for through, (before, after) in zip(clear.unbind(0), pairwise(lights.unbind(0)), strict=True):
+        torch.mul(before, through, out=after)
 
 
-def _stop(alpha: Tensor, after: Tensor) -> None:
+def _stop(alpha: Tensor, after: Tensor, scratch: Scratch) -> None:
     """Take out the Gaussian that would end a pixel, and all behind it. In floats: comparisons cost five times as much."""
-    alpha.mul_(torch.threshold(after, TRANSMITTANCE_MIN, 0.0).mul_(1e30).clamp_(max=1.0))
+    drawn = torch.sub(after, TRANSMITTANCE_MIN, out=scratch.take("drawn", *after.shape))
+    alpha.mul_(drawn.mul_(1e30).clamp_(0.0, 1.0))
 
 
 def march(lists: CellLists, pixels: int, budget: int) -> Iterator[Stretch]:

@@ -79,8 +79,7 @@ def _backward_block(block: Block, monomials: Tensor, upstream: Tensor, behind: T
     rest = scratch.take("rest", depth, width, pixels)
     _pass_by(behind, share, rest)
     # d loss / d exponent = alpha T (value . upstream) - alpha / (1 - alpha) * what lies behind
-    ratio = torch.sub(1.0, block.alpha, out=scratch.take("seen", depth, width, pixels))
-    g = share.addcmul_(torch.div(block.alpha, ratio, out=ratio), rest, value=-1.0)
+    g = share.addcmul_(torch.div(block.alpha, block.clear, out=block.clear), rest, value=-1.0)
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
@@ -128,17 +127,26 @@ def _lists(ellipses: Ellipses, strips: Strips, grid: CellGrid, budget: int, tran
         yield list_cells(ellipses, strips, run, grid, alive)
 
 
+def _plane(cells: Tensor, grid: CellGrid) -> Tensor:
+    """One channel of cells [cells, p] as (camera, cell row, y, cell column, x), a view."""
+    return rearrange(cells, "(c r k) (y x) -> c r y k x", c=grid.cameras, r=grid.rows, k=grid.columns, y=grid.size, x=grid.size)
+
+
 def _to_image(cells: Tensor, grid: CellGrid) -> Tensor:
-    """[cells, d, p] -> [c, h, w, d]."""
-    shape = dict(c=grid.cameras, r=grid.rows, k=grid.columns, y=grid.size)
-    return rearrange(cells, "(c r k) d (y x) -> c (r y) (k x) d", **shape)[:, : grid.height, : grid.width]
+    """[cells, d, p] -> [c, h, w, d]; channel by channel, which is what keeps a CPU's copies in long runs."""
+    height, width, size = grid.height, grid.width, grid.size
+    image = cells.new_empty(grid.cameras, grid.rows * size, grid.columns * size, cells.shape[1])
+    for channel in range(cells.shape[1]):
+        rearrange(image[..., channel], "c (r y) (k x) -> c r y k x", y=size, x=size).copy_(_plane(cells[:, channel], grid))
+    return image[:, :height, :width].contiguous()
 
 
-def _to_cells(image: Tensor, grid: CellGrid) -> Tensor:
-    """[c, h, w, d] -> [cells, d, p]; pixels beyond the border hold zeros."""
+def _to_cells(images: list[Tensor], grid: CellGrid) -> Tensor:
+    """Images [c, h, w, d] side by side -> [cells, d, p]; pixels beyond the border hold zeros."""
     right, below = grid.columns * grid.size - grid.width, grid.rows * grid.size - grid.height
-    padded = F.pad(image, (0, 0, 0, right, 0, below)) if right or below else image
-    return rearrange(padded, "c (r y) (k x) d -> (c r k) d (y x)", y=grid.size, x=grid.size).contiguous()
+    planes = torch.cat([image.permute(3, 0, 1, 2) for image in images])
+    planes = F.pad(planes, (0, right, 0, below)) if right or below else planes
+    return rearrange(planes, "d c (r y) (k x) -> (c r k) d (y x)", y=grid.size, x=grid.size).contiguous()
 
 
 class _Composite(torch.autograd.Function):
@@ -155,8 +163,7 @@ class _Composite(torch.autograd.Function):
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
                         _forward_block(block, local, scratch)
                     image.index_add_(0, stretch.cells, local)
-            out = _to_image(image, grid)
-            colors, alphas = out[..., :-1].contiguous(), out[..., -1:].contiguous()
+            colors, alphas = _to_image(image[:, :-1], grid), _to_image(image[:, -1:], grid)
         ctx.save_for_backward(means2d, conics, opacities, values, chosen, image)
         ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
         return colors, alphas
@@ -168,7 +175,7 @@ class _Composite(torch.autograd.Function):
         ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
         with single_thread():
             table, scratch = table_of(ellipses, values, grid, settings.alpha_cap), Scratch(values)
-            upstream = _to_cells(torch.cat([v_colors, v_alphas], dim=-1), grid)
+            upstream = _to_cells([v_colors, v_alphas], grid)
             behind = (image * upstream).sum(dim=1)
             transmittance = torch.ones_like(behind)
             channels = values.shape[1]
