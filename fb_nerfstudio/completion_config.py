@@ -64,6 +64,8 @@ class CompletionConfig:
     """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn equally often."""
     generated_pixels: Literal["all", "unseen"] = "unseen"
     """Train only on the pixels of generated views that the capture has not seen, or on all (the paper); photographs know better."""
+    match_colors: bool = True
+    """Shift the colours of generated views smoothly so that they meet the splats' where the capture has seen them."""
     view_weight: float = 1.0
     """Weight of a generated view's loss; captured views have 1."""
     seed_gaussians: bool = True

@@ -31,7 +31,17 @@ from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
 from fb_nerfstudio.dataparser import without_open3d
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
-from fb_nerfstudio.unseen import TRAINED_STEPS, coarse, find_unseen, render_geometry, surface_points, unseen_gaussians, with_unseen_masks
+from fb_nerfstudio.start_points import start_points
+from fb_nerfstudio.unseen import (
+    TRAINED_STEPS,
+    coarse,
+    find_unseen,
+    render_geometry,
+    surface_points,
+    unseen_gaussians,
+    with_matched_colors,
+    with_unseen_masks,
+)
 from fb_nerfstudio.viewer import CompletionPanel
 
 COMPLETION_FOLDER = "completion"
@@ -46,6 +56,12 @@ class FillerbusterDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: FillerbusterDataManager)
     completion: CompletionConfig = field(default_factory=CompletionConfig)
     """Generating views of what the capture has not seen."""
+    start_points: int = 5000
+    """Captures without a point cloud: triangulate the photos' features, and fill up to this many points; 0 starts at random in a cube."""
+
+    def __post_init__(self) -> None:
+        if self.start_points < 0:
+            raise ValueError(f"start_points: expected 0 or more, got {self.start_points}")
 
 
 class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
@@ -75,6 +91,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             refuse_bad_capture(config)
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+        if test_mode == "val" and config.start_points > 0 and "points3D_xyz" not in self.train_dataparser_outputs.metadata:
+            self._find_start_points()
         self.completion_panel = CompletionPanel()  # public: nerfstudio's viewer looks for it by type
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: CompletedViews | None = None
@@ -83,6 +101,14 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._finished = False
         self._captured_draws = 0
         self._epoch: tuple[int, list[int]] = (-1, [])
+
+    def _find_start_points(self) -> None:
+        """Give the pipeline points to start the splats from, where the capture brings none."""
+        CONSOLE.print("The capture has no point cloud: triangulating its photos.")
+        points, colors = start_points(self.train_dataparser_outputs, count=self.config.start_points, seed=self.config.completion.seed)
+        if len(points):
+            metadata = self.train_dataparser_outputs.metadata
+            metadata |= {"points3D_xyz": points, "points3D_rgb": (colors * 255).round().to(torch.uint8)}
 
     # ------------------------------------------------------------------------------------------------ training batches
 
@@ -226,6 +252,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             return 0
         rendered = render_geometry(splats, coarse(self._bank.cameras)) if step >= TRAINED_STEPS else None
         unseen = find_unseen(self._bank, cameras, shell, rendered)
+        if config.match_colors and rendered is not None:
+            self._set_bank(with_matched_colors(self._bank, unseen, rendered))
         if config.generated_pixels == "unseen":
             self._set_bank(with_unseen_masks(self._bank, unseen))
         if not seeds:

@@ -22,6 +22,7 @@ from fb_core.geometry.paths import seen_by
 from fb_core.geometry.shell import Shell, intersect
 from fb_nerfstudio.bridge import to_nerfstudio
 from fb_nerfstudio.completed_views import CompletedViews
+from fb_nerfstudio.seams import without_seams
 
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
@@ -34,12 +35,14 @@ _SIDE = 64  # pixels; what was seen is judged on pictures of at most this size, 
 
 @dataclass(frozen=True, kw_only=True)
 class Rendered:
-    """What the splats look like from some cameras."""
+    """What the splats look like from some cameras, on the CPU."""
 
     depth: Float[Tensor, "n h w"]
     """Expected z-depth in scene units; means nothing where accumulation is low."""
     accumulation: Float[Tensor, "n h w"]
     """Opacity in [0, 1]."""
+    rgb: Float[Tensor, "n 3 h w"]
+    """Colours in [0, 1], over the model's background where the splats are not opaque."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +63,7 @@ def coarse(cameras: Pinholes) -> Pinholes:
 
 @torch.no_grad()
 def render_geometry(model: Model, cameras: Pinholes) -> Rendered:
-    """Depth and accumulation of the splats from each camera, in evaluation mode; the training mode is restored. On the CPU."""
+    """Colours, depth and accumulation of the splats from each camera, in evaluation mode; the training mode is restored. On the CPU."""
     was_training = model.training
     model.eval()
     try:
@@ -70,6 +73,7 @@ def render_geometry(model: Model, cameras: Pinholes) -> Rendered:
     return Rendered(
         depth=torch.stack([one["depth"][..., 0].float().cpu() for one in outputs]),
         accumulation=torch.stack([one["accumulation"][..., 0].float().cpu() for one in outputs]),
+        rgb=torch.stack([one["rgb"].movedim(-1, 0).float().cpu() for one in outputs]),
     )
 
 
@@ -121,6 +125,16 @@ def _widened(camera: Pinholes) -> Pinholes:
     """The same camera with a picture that shows more to all sides."""
     x, y = round(camera.width * _BESIDE), round(camera.height * _BESIDE)
     return camera.cropped(-x, -y, camera.width + 2 * x, camera.height + 2 * y)
+
+
+def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendered) -> CompletedViews:
+    """The views with colours that meet the splats' where the capture has seen them (:mod:`fb_nerfstudio.seams`)."""
+    images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
+    size = images.shape[2:]
+    reliable = ~unseen.mask & (rendered.accumulation >= _FIRM)
+    colors = F.interpolate(rendered.rgb, size=size, mode="bilinear", align_corners=False)
+    matched = without_seams(images, colors, F.interpolate(reliable[:, None].float(), size=size, mode="nearest")[:, 0] > 0)
+    return dataclasses.replace(views, images=rearrange((matched * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous())
 
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:

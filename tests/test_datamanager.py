@@ -24,7 +24,7 @@ from fb_core.views import Views
 from fb_nerfstudio.completed_views import CompletedViews, Origin
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
-from fb_nerfstudio.unseen import Rendered, find_unseen, unseen_gaussians, with_unseen_masks
+from fb_nerfstudio.unseen import Rendered, find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
 
 
 class GreyFiller:
@@ -59,7 +59,7 @@ class ToySplats(torch.nn.Module):
         height, width = int(camera.height), int(camera.width)
         accumulation = torch.zeros(height, width, 1)
         accumulation[:, : width // 2] = 1.0
-        return {"depth": torch.full((height, width, 1), 2.0), "accumulation": accumulation}
+        return {"depth": torch.full((height, width, 1), 2.0), "accumulation": accumulation, "rgb": torch.full((height, width, 3), 0.5)}
 
     def add_gaussians(self, points, colors, optimizers) -> int:
         self.added.append((points, colors))
@@ -440,9 +440,11 @@ def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at()
     captured = dataclasses.replace(views.cameras[0], focal=views.cameras.focal[:1] / 2)
     accumulation = torch.ones(2, 8, 8)
     accumulation[0, :, 4:] = 0.1
-    unseen = find_unseen(
-        views, [captured], sphere(torch.zeros(3), 3.0), Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=accumulation)
-    )
+    rendered = Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=accumulation, rgb=torch.full((2, 3, 8, 8), 0.5))
+    unseen = find_unseen(views, [captured], sphere(torch.zeros(3), 3.0), rendered)
+    matched = with_matched_colors(views, unseen, rendered).images.float() / 255
+    assert float((matched[0, :, :4] - 0.5).abs().max()) < 0.01, "what is seen has the splats' colour"
+    assert torch.equal(with_matched_colors(views, unseen, rendered).images[1], views.images[1]), "nothing seen, nothing changed"
     assert not unseen.mask[0, :, :4].any() and unseen.mask[0, :, 4:].all() and unseen.mask[1].all()
     masked = with_unseen_masks(views, unseen)
     assert masked.masks[0, :, 4:].all() and not masked.masks[0, :, :4].any()

@@ -90,3 +90,26 @@ def _fisheye_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pinhol
     straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(matrix, coefficients, size, np.eye(3), balance=0)
     maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), straight, size, cv2.CV_32FC1)
     return _with_matrix(camera, straight), maps
+
+
+def straight_directions(
+    points: Float[Tensor, "m 2"], camera: Pinholes, camera_model: str, distortion: dict[str, float]
+) -> Float[Tensor, "m 3"]:
+    """Unit viewing directions, in camera axes, of places in a bent picture (pixels, the first pixel's centre is 0.5, 0.5).
+
+    Raises ValueError for a lens that cannot be undistorted.
+    """
+    check_lens(camera_model, distortion, "straight_directions")
+    import cv2
+
+    if len(points) == 0:
+        return points.new_zeros(0, 3)
+    bent = (points.double() - 0.5).numpy()[:, None]
+    if camera_model in FISHEYE_MODELS:
+        coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
+        plane = cv2.fisheye.undistortPoints(bent, _matrix(camera), coefficients)
+    else:
+        coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+        plane = cv2.undistortPoints(bent, _matrix(camera), coefficients)
+    directions = torch.nn.functional.pad(torch.from_numpy(plane.reshape(-1, 2)), (0, 1), value=1.0)
+    return torch.nn.functional.normalize(directions, dim=-1).to(points.dtype)
