@@ -43,7 +43,13 @@ class CappedStrategy(DefaultStrategy):
             duplicate(params=params, optimizers=optimizers, state=state, mask=copies)
         if halved:
             not_copies = torch.zeros(copied, dtype=torch.bool, device=splits.device)
-            split(params=params, optimizers=optimizers, state=state, mask=torch.cat([splits, not_copies]))
+            split(
+                params=params,
+                optimizers=optimizers,
+                state=state,
+                mask=torch.cat([splits, not_copies]),
+                revised_opacity=self.revised_opacity,
+            )
         return copied, halved
 
 

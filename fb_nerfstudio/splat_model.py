@@ -25,6 +25,7 @@ from fb_nerfstudio.bridge import flip_axes, to_pinholes
 from fb_nerfstudio.densification import CappedStrategy, append_rows
 from fb_nerfstudio.gaussians import evenly_chosen, gaussians_at, random_points
 from fb_nerfstudio.lazy_lpips import LazyLpips
+from fb_nerfstudio.mcmc import CappedMCMC, penalize
 from fb_nerfstudio.normal_losses import alignment_loss, blended_normals, gaussian_normals, total_variation
 from fb_nerfstudio.splat_backend import render_splats
 from fb_nerfstudio.torch_spherical_harmonics import sh_colors
@@ -33,6 +34,8 @@ logger = logging.getLogger(__name__)
 
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Viser's default grey: what stands behind renders where training uses random backgrounds."""
+_MOST_WITHOUT_LIMIT = 1_000_000
+"""Where MCMC stops growing without a limit: it grows until one is reached (gsplat's default)."""
 _FINAL_STEP = 30000
 """The step a restored model pretends to be at until training sets it: harmonics and resolution are final then."""
 
@@ -43,8 +46,16 @@ class FillerbusterSplatModelConfig(SplatfactoModelConfig):
 
     _target: type = field(default_factory=lambda: FillerbusterSplatModel)
     """target class to instantiate"""
+    strategy: Literal["default", "mcmc"] = "default"
+    """How Gaussians multiply: by screen gradients (3DGS), or by Monte Carlo relocation up to the limit, without opacity resets (MCMC)."""
     max_gaussians: int | None = None
     """Most Gaussians that initialisation, densification and added points may lead to; None for no limit. A CPU wants about 20000."""
+    mcmc_noise_lr: float = 5e5
+    """MCMC: noise on the positions of nearly transparent Gaussians, times the means' learning rate and their covariance."""
+    mcmc_opacity_penalty: float = 0.01
+    """MCMC: weight of the mean opacity, in views that draw the Gaussian; what nobody needs fades and moves elsewhere."""
+    mcmc_scale_penalty: float = 0.01
+    """MCMC: weight of the mean standard deviation (scene units), in views that draw the Gaussian."""
     output_normals: bool = True
     """Also render `normal` and `surface_normal` in the viewer and in evaluation."""
     normal_loss_from: int = 10000
@@ -59,6 +70,13 @@ class FillerbusterSplatModelConfig(SplatfactoModelConfig):
     def __post_init__(self) -> None:
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians: expected at least 1 or None for no limit, got {self.max_gaussians}")
+        if self.strategy not in ("default", "mcmc"):
+            raise ValueError(f"strategy: expected 'default' or 'mcmc', got {self.strategy!r}")
+        if min(self.mcmc_noise_lr, self.mcmc_opacity_penalty, self.mcmc_scale_penalty) < 0:
+            raise ValueError(
+                "mcmc_noise_lr, mcmc_opacity_penalty and mcmc_scale_penalty: expected values >= 0, got "
+                f"{self.mcmc_noise_lr}, {self.mcmc_opacity_penalty} and {self.mcmc_scale_penalty}"
+            )
         if min(self.normal_alignment_weight, self.normal_tv_weight) < 0:
             raise ValueError(
                 "normal_alignment_weight and normal_tv_weight: expected values >= 0, got "
@@ -101,8 +119,16 @@ class FillerbusterSplatModel(SplatfactoModel):
         chosen = evenly_chosen(len(points), len(points) if limit is None else limit)
         return gaussians_at(points[chosen], colors[chosen], sh_degree=config.sh_degree)
 
-    def _make_strategy(self) -> CappedStrategy:
+    def _make_strategy(self) -> CappedStrategy | CappedMCMC:
         config = self.config
+        if config.strategy == "mcmc":
+            return CappedMCMC(
+                cap_max=_MOST_WITHOUT_LIMIT if config.max_gaussians is None else config.max_gaussians,
+                noise_lr=config.mcmc_noise_lr,
+                refine_start_iter=config.warmup_length,
+                refine_stop_iter=config.stop_split_at,
+                refine_every=config.refine_every,
+            )
         return CappedStrategy(
             prune_opa=config.cull_alpha_thresh,
             grow_grad2d=config.densify_grad_thresh,
@@ -260,11 +286,15 @@ class FillerbusterSplatModel(SplatfactoModel):
         if with_normals:
             normals = gaussian_normals(splats["means"], splats["quats"], splats["scales"], pinhole)
             colors = torch.cat([colors, normals], dim=-1)
+        scales, opacities = splats["scales"].exp(), splats["opacities"].sigmoid().squeeze(-1)
+        if self.training and self.config.strategy == "mcmc":
+            penalize(scales, self.config.mcmc_scale_penalty)
+            penalize(opacities, self.config.mcmc_opacity_penalty)
         drawn = render_splats(
             means=splats["means"],
             quats=splats["quats"],
-            scales=splats["scales"].exp(),
-            opacities=splats["opacities"].sigmoid().squeeze(-1),
+            scales=scales,
+            opacities=opacities,
             colors=colors,
             viewmats=pinhole.world_to_camera,
             Ks=pinhole.intrinsics,

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int32
 from torch import Tensor
 
@@ -131,7 +130,8 @@ class Stretch:
     """Cells of similar length that are walked together, front to back, until most are opaque or all are done."""
 
     def __init__(self, cells: Tensor, counts: Tensor, starts: Tensor, rank: int):
-        self.cells, self.rest = cells, None
+        self.cells = cells
+        self.rest: Stretch | None = None
         """`rest`: after `blocks`, the stretch of the cells that still need work, or None."""
         self._counts, self._starts, self._rank = counts, starts, rank
         self._ranks = torch.arange(int(counts[0]), dtype=torch.int32, device=counts.device)[:, None]
@@ -158,7 +158,8 @@ class Stretch:
                 if int(still.sum()) <= 0.75 * width:
                     kept = still.nonzero()[:, 0]
                     if kept.numel():
-                        self.rest = Stretch(*(column.index_select(0, kept) for column in (self.cells, self._counts, self._starts)), rank)
+                        cells, counts, starts = (column.index_select(0, kept) for column in (self.cells, self._counts, self._starts))
+                        self.rest = Stretch(cells, counts, starts, rank)
                     break
         transmittance.index_copy_(0, self.cells, light)
 
@@ -189,7 +190,7 @@ def _block(
         k[0].masked_fill_(padding.view(-1), _NEVER)
     alpha = torch.mm(k[:TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
     # To the base 2 because torch's exp2 is twice as fast as its exp.
-    alpha = F.threshold_(alpha.exp2_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
+    alpha = torch.threshold_(alpha.exp2_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
     capped = None
     if table.cap is not None and float(alpha.max()) > table.cap:
         capped = alpha > table.cap

@@ -65,8 +65,8 @@ class Shapes:
         """From quaternions (wxyz) of any length [n, 4] and scales [n, 3], or from covariances [n, 3, 3]."""
         if covars is not None:
             return cls(covariance=covars.permute(1, 2, 0).contiguous())
-        unit, inverse_length = _unit_quaternions(quats)
-        return cls(unit=unit, inverse_length=inverse_length, rotation=_rotations(unit), scales=scales.t().contiguous())
+        unit, inverse_length = unit_quaternions(quats)
+        return cls(unit=unit, inverse_length=inverse_length, rotation=rotations(unit), scales=scales.t().contiguous())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ class Footprint:
     determinant: Tensor
 
 
-def _unit_quaternions(quats: Tensor) -> tuple[Tensor, Tensor]:
+def unit_quaternions(quats: Tensor) -> tuple[Tensor, Tensor]:
     columns = quats.t().contiguous()
     length = columns.square().sum(dim=0).sqrt_()
     if bool((length > 0).all()):
@@ -106,7 +106,7 @@ def _unit_quaternions(quats: Tensor) -> tuple[Tensor, Tensor]:
     return columns, inverse.masked_fill_(zero, 0.0)
 
 
-def _rotations(unit: Float[Tensor, "4 n"]) -> Float[Tensor, "3 3 n"]:
+def rotations(unit: Float[Tensor, "4 n"]) -> Float[Tensor, "3 3 n"]:
     """Rotation matrices of unit quaternions (wxyz)."""
     w, x, y, z = unit.unbind(0)
     twice = unit[1:] * 2.0
