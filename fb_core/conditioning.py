@@ -7,6 +7,7 @@ raymap, [64] image mask, [65] ray mask. Its 32 outputs are the image velocity [0
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -65,14 +66,14 @@ def encode_known(
     image_vae: VAE,
     raymap_vae: VAE,
     views_at_once: int = 16,
-    generator: torch.Generator | None = None,
+    generators: Sequence[torch.Generator] | None = None,
 ) -> Conditioning:
     """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
 
-    With a generator (on the CPU) the posteriors are sampled, otherwise their means are taken.
+    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken.
     """
-    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once, generator)
-    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generator)
+    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once, generators)
+    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generators)
     return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known))
 
 
@@ -86,13 +87,17 @@ def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: 
 
 
 def encode_in_chunks(
-    vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int, generator: torch.Generator | None = None
+    vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int, generators: Sequence[torch.Generator] | None = None
 ) -> Float[Tensor, "n 16 lh lw"]:
     """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own precision.
 
-    With a generator they are samples, which do not depend on how many views are encoded at a time.
+    With a generator for each view they are samples, which depend neither on the other views nor on how many are encoded at a time.
     """
-    return torch.cat([vae.encode(chunk, generator) for chunk in pixels.split(views_at_once)])
+    chunks = []
+    for first in range(0, len(pixels), views_at_once):
+        part = slice(first, first + views_at_once)
+        chunks.append(vae.encode(pixels[part], None if generators is None else generators[part]))
+    return torch.cat(chunks)
 
 
 def decode_in_chunks(

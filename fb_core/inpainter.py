@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,21 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core import checkpoint
-from fb_core.conditioning import (
-    LATENT_CHANNELS,
-    STATE_CHANNELS,
-    Conditioning,
-    decode_in_chunks,
-    encode_known,
-    encode_null,
-    only_known,
-    split,
-)
+from fb_core.conditioning import LATENT_CHANNELS, decode_in_chunks, encode_in_chunks, encode_known, encode_null, only_known, split, unsplit
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
 from fb_core.memory import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
-from fb_core.networks.prepared import Prepared
 from fb_core.networks.text import TextEncoder
-from fb_core.sampler import OnStep, SamplingConfig, branches, guidance_map, guided, integrate, tiled, time_grid
+from fb_core.sampling.denoising import Denoising
+from fb_core.sampling.options import SamplingConfig
+from fb_core.sampling.preview import Progress
+from fb_core.sampling.randomness import noise_of, posterior_generators, random_orders
+from fb_core.sampling.trajectory import OnStep, SamplingInterrupted
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
@@ -95,7 +90,7 @@ class Fillerbuster:
     @property
     def recommended_sampling(self) -> SamplingConfig:
         """How this model samples best, where its folder says (the paper's values otherwise)."""
-        return SamplingConfig(**self.info.get("sampling", {}))
+        return SamplingConfig.from_dict(self.info.get("sampling", {}))
 
     def estimate(
         self, views: int, size: tuple[int, int], sampling: SamplingConfig = SamplingConfig(), *, prompt: str | None = None
@@ -112,7 +107,10 @@ class Fillerbuster:
         generator: torch.Generator,
         sampling: SamplingConfig = SamplingConfig(),
         on_step: OnStep | None = None,
+        on_progress: Callable[[Progress], None] | None = None,
         prompt: str | None = None,
+        current: Views | None = None,
+        resume: SamplingInterrupted | None = None,
     ) -> Views:
         """Fill all that is unknown; known pixels and rays are returned as given, and all masks are 1.
 
@@ -121,39 +119,53 @@ class Fillerbuster:
             generator: decides the sample, on the CPU. Each view's noise depends only on it and on the view's place.
             sampling: steps, guidance, windows, memory.
             on_step: called with (steps done, steps in all).
+            on_progress: called after every step with the step, the time reached, and a cheap preview that is made only when asked for.
             prompt: says what is to be seen, for models that read text; None and "" cost nothing.
+            current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1; all
+                of their pixels and rays count, except where `views` knows better.
+            resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not drawn from.
 
         Raises:
+            SamplingInterrupted: a KeyboardInterrupt while denoising. Model and arguments are as they were; the error holds the trajectory
+                as far as it got, for `resume`.
             ValueError: for no views, views that are too small, known pixels or rays that are not finite, a prompt that the model cannot
                 read, or too little memory however the work is cut (saying what would fit).
         """
         _check(views)
+        if current is not None:
+            _check_current(current, views)
         text = self._text_of(prompt if sampling.guidance_text else None)
         cut = self._cut(len(views), views.size, sampling, prompt)
-        seed = int(torch.randint(0, 2**62, (), generator=generator))
+        seed = None if resume is None else resume.seed
+        seed = int(torch.randint(0, 2**62, (), generator=generator)) if seed is None else seed
         height, width = views.size
         padded = _padded(views.to(self.device))
         frame = _frame_of(padded)
-        canonical = only_known(padded.raymaps, padded.rays_known)
-        if frame is not None:
-            canonical = only_known(frame.apply(canonical), padded.rays_known)
-        conditioning = encode_known(
-            padded.images,
-            padded.image_known,
-            to_unit_range(canonical),
-            padded.rays_known,
-            image_vae=self.image_vae,
-            raymap_vae=self.raymap_vae,
-            views_at_once=cut.views_encoded,
-            generator=torch.Generator().manual_seed(_mixed(seed, -2)) if sampling.sample_posterior else None,
-        )
-        del canonical
-        null = encode_null(conditioning, image_vae=self.image_vae, raymap_vae=self.raymap_vae, pixels=padded.size)
-        latents = self._denoise(conditioning, null, text, seed=seed, sampling=sampling, branches_at_once=cut.branches, on_step=on_step)
+        started = None
+        if current is not None and sampling.strength < 1:
+            started = self._encoded(_padded(current.to(self.device), mode="replicate"), padded, frame, cut)
+        denoising = self._denoising(padded, frame, started, text, seed, sampling, cut)
+        look = None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
+        try:
+            latents = denoising.run(on_step=on_step, on_trajectory=look, resume=None if resume is None else resume.trajectory)
+        except SamplingInterrupted as stopped:
+            stopped.seed = seed
+            raise
+        del denoising
         filled = self._decode(padded, latents, frame, cut)
         return dataclasses.replace(
             filled, **{f.name: getattr(filled, f.name)[..., :height, :width].to(views.images.device) for f in dataclasses.fields(Views)}
         )
+
+    def recover_raymaps(
+        self, images: Float[Tensor, "n 3 h w"], *, generator: torch.Generator, sampling: SamplingConfig | None = None
+    ) -> Float[Tensor, "n 6 h w"]:
+        """Raymaps of photos without poses (paper, "Raymap prediction"), in a canonical frame of their own: the cube [-1, 1]^3.
+
+        None samples as `recommended_sampling.for_poses()` says. Raises as `complete` does.
+        """
+        sampling = self.recommended_sampling.for_poses() if sampling is None else sampling
+        return self.complete(Views.unposed(images), generator=generator, sampling=sampling).raymaps
 
     def _text_of(self, prompt: str | None) -> Float[Tensor, "texts words t"] | None:
         """Embeddings of the empty prompt and, if there is one, of the prompt; None for a model without text."""
@@ -190,32 +202,52 @@ class Fillerbuster:
         _logger.debug("%d views of %dx%d: %.2f GiB, %s", views, size[1], size[0], expected.peak / 2**30, expected.cut)
         return expected.cut
 
-    def _denoise(
+    def _denoising(
         self,
-        conditioning: Conditioning,
-        null: Conditioning,
+        views: Views,
+        frame: CanonicalFrame | None,
+        current: Tensor | None,
         text: Tensor | None,
-        *,
         seed: int,
         sampling: SamplingConfig,
-        branches_at_once: int | None,
-        on_step: OnStep | None,
-    ) -> Float[Tensor, "n 32 h w"]:
-        """Latents at t = 0. Two texts, the empty and another, make one more branch."""
-        partitions = torch.Generator().manual_seed(_mixed(seed, -1))
-        scale = guidance_map(conditioning, known=sampling.guidance_known, unknown=sampling.guidance_unknown)
-        times = time_grid(sampling.steps, shift=sampling.shift)
-        parts = branches(conditioning, null, scale)
-        prompted = text is not None and len(text) == 2
-        if text is not None and prompted:
-            text = torch.stack([text[0]] * len(parts) + [text[1]])
-            parts = [*parts, conditioning]
-        channels = torch.stack([part.channels for part in parts])
-        prepared = Prepared(self.dit, channels, times[:-1], text=text, branches_at_once=branches_at_once)
-        predict = tiled(prepared, window=sampling.window, rounds=sampling.rounds, generator=partitions)
-        noise = noise_of(seed, conditioning.channels.shape[0], tuple(conditioning.channels.shape[-2:])).to(self.device)
-        field = guided(predict, scale, text_scale=sampling.guidance_text if prompted else None)
-        return integrate(field, noise, times, solver=sampling.solver, on_step=on_step)
+        cut: Cut,
+    ) -> Denoising:
+        """What is known of the padded views, encoded, with all draws."""
+        canonical = only_known(views.raymaps, views.rays_known)
+        if frame is not None:
+            canonical = only_known(frame.apply(canonical), views.rays_known)
+        vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
+        conditioning = encode_known(
+            views.images,
+            views.image_known,
+            to_unit_range(canonical),
+            views.rays_known,
+            **vaes,
+            views_at_once=cut.views_encoded,
+            generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
+        )
+        del canonical
+        height, width = conditioning.channels.shape[-2:]
+        return Denoising(
+            dit=self.dit,
+            conditioning=conditioning,
+            null=encode_null(conditioning, **vaes, pixels=views.size),
+            noise=noise_of(seed, len(views), (height, width)).to(self.device),
+            orders=random_orders(seed),
+            sampling=sampling,
+            text=text,
+            current=current,
+            branches_at_once=cut.branches,
+        )
+
+    def _encoded(self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut) -> Float[Tensor, "n 32 h w"]:
+        """Latents of current views, where known pixels and rays take the place of the current ones."""
+        images = only_known(views.images, views.image_known) + (1 - views.image_known) * current.images
+        raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps)
+        raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1)
+        return unsplit(
+            encode_in_chunks(self.image_vae, images, cut.views_encoded), encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded)
+        )
 
     def _decode(self, views: Views, latents: Tensor, frame: CanonicalFrame | None, cut: Cut) -> Views:
         """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not decoded."""
@@ -236,22 +268,6 @@ class Fillerbuster:
         return Views(images=images, image_known=ones, raymaps=raymaps, rays_known=ones)
 
 
-def noise_of(seed: int, views: int, latent_size: tuple[int, int]) -> Float[Tensor, "n 32 h w"]:
-    """Initial noise on the CPU; a view's noise depends on the seed and its place alone, not on how many views there are."""
-    draws = [
-        torch.randn(STATE_CHANNELS, *latent_size, generator=torch.Generator().manual_seed(_mixed(seed, view))) for view in range(views)
-    ]
-    return torch.stack(draws)
-
-
-def _mixed(seed: int, stream: int) -> int:
-    """A seed for one of many independent streams (the finaliser of SplitMix64)."""
-    value = (seed + 0x9E3779B97F4A7C15 * (stream + 2)) % 2**64
-    value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) % 2**64
-    return (value ^ (value >> 31)) % 2**63
-
-
 def _check(views: Views) -> None:
     if len(views) == 0:
         raise ValueError("complete: expected at least one view, got none")
@@ -268,13 +284,21 @@ def _check(views: Views) -> None:
             raise ValueError(f"complete: {broken} known {what} are NaN or infinite; mark them as unknown (mask 0) or repair them")
 
 
-def _padded(views: Views) -> Views:
+def _check_current(current: Views, views: Views) -> None:
+    if len(current) != len(views) or current.size != views.size:
+        expected, got = (f"{len(some)} views of {some.size[1]}x{some.size[0]}" for some in (views, current))
+        raise ValueError(f"current: expected {expected} like the views to be completed, got {got}")
+    if not bool(torch.isfinite(current.images).all() & torch.isfinite(current.raymaps).all()):
+        raise ValueError("current: pixels or rays are NaN or infinite; pass whole views, such as an earlier answer of complete")
+
+
+def _padded(views: Views, *, mode: str = "constant") -> Views:
     """Sides brought up to multiples of 16 with pixels and rays that are unknown."""
     height, width = views.size
     extra = (0, -width % SIDE_MULTIPLE, 0, -height % SIDE_MULTIPLE)
     if not any(extra):
         return views
-    return dataclasses.replace(views, **{f.name: F.pad(getattr(views, f.name), extra) for f in dataclasses.fields(Views)})
+    return dataclasses.replace(views, **{f.name: F.pad(getattr(views, f.name), extra, mode=mode) for f in dataclasses.fields(Views)})
 
 
 def _frame_of(views: Views) -> CanonicalFrame | None:

@@ -279,7 +279,7 @@ def _denoising_bytes(
         prepared = Prepared(dit, channels, times[:-1], text=texts, branches_at_once=branches)
         predict = tiled(prepared, window=sampling.window, rounds=1)
         scale = torch.empty_like(noise) + 1
-        field = guided(predict, scale, text_scale=1.0 if prompted and sampling.guidance_text else None)
+        field = guided(predict, scale, text_scale=1.0 if prompted and sampling.guidance_text else None, variant=sampling.guidance)
         integrate(field, noise + 1, [*times[:2], 0.0] if len(times) > 2 else times, solver=sampling.solver)
     norms = 3 if config.text_width else 2
     kept = 4 * norms * 2 * config.width * sampling.steps

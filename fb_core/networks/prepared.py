@@ -6,6 +6,7 @@ released weights, once instead of at every step). What the branches of guidance 
 modulations, is computed once for all of them.
 """
 
+import copy
 from collections.abc import Sequence
 
 import torch
@@ -84,6 +85,18 @@ class Prepared:
             patches = self.dit.run_blocks(together, modulation, [self._context(context, part) for context in self._contexts])
             velocities.append(self.dit.unpatchify(patches, count, *self._size))
         return torch.cat(velocities).to(state.dtype)
+
+    def only(self, branches: slice) -> "Prepared":
+        """The same with some of its branches; shares all constants, so it costs nothing."""
+        chosen = copy.copy(self)
+        chosen._tokens = self._tokens[branches]
+        chosen.branches = len(chosen._tokens)
+        chosen.branches_at_once = min(self.branches_at_once, chosen.branches)
+        chosen._contexts = [
+            context if context is None or len(context[0]) == 1 else KeysValues(*(x[branches] for x in context))
+            for context in self._contexts
+        ]
+        return chosen
 
     def _modulation(self, time: float, device: torch.device) -> Modulation:
         step = self._times.get(time)

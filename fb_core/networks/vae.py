@@ -5,7 +5,7 @@ narrower one without normalisation and with replicated borders, because a raymap
 Parameter names are those of the released checkpoints. Callers hold values in [0, 1]; that the network sees [-1, 1] is its own business.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -249,11 +249,16 @@ class VAE(nn.Module):
         mean, logvar = moments.to(x01.dtype).chunk(2, dim=1)
         return mean, logvar.clamp(*LOGVAR_RANGE)
 
-    def encode(self, x01: Float[Tensor, "n c h w"], generator: torch.Generator | None = None) -> Float[Tensor, "n z h//8 w//8"]:
-        """Scaled latents of pictures: the posterior's mean, or a sample of it when a generator is given."""
+    def encode(
+        self, x01: Float[Tensor, "n c h w"], generator: torch.Generator | Sequence[torch.Generator] | None = None
+    ) -> Float[Tensor, "n z h//8 w//8"]:
+        """Scaled latents of pictures: the posterior's mean, or a sample of it when a generator is given (or one for each picture)."""
         mean, logvar = self.posterior(x01)
         if generator is not None:
-            noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean)
+            if isinstance(generator, torch.Generator):
+                noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean)
+            else:
+                noise = torch.stack([torch.randn(mean.shape[1:], generator=one, device=one.device) for one in generator]).to(mean)
             mean = mean + (0.5 * logvar).exp() * noise
         return self.config.scaling * mean
 

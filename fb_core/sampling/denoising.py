@@ -1,0 +1,98 @@
+"""The denoising of one sequence, put together: prepared network, tiling, guidance, known latents, start, solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.conditioning import STATE_CHANNELS, Conditioning
+from fb_core.networks.dit import DiT
+from fb_core.networks.prepared import Prepared
+from fb_core.sampling.guidance import branches, guidance_map, guided
+from fb_core.sampling.options import SamplingConfig
+from fb_core.sampling.randomness import Orders
+from fb_core.sampling.reference import reference_field
+from fb_core.sampling.solvers import VelocityField
+from fb_core.sampling.starts import imposed, reference_started, started, wholly_known
+from fb_core.sampling.tiling import tiled
+from fb_core.sampling.trajectory import OnStep, OnTrajectory, Trajectory, integrate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Denoising:
+    """All that decides the latents of one sequence."""
+
+    dit: DiT
+    """The network."""
+    conditioning: Conditioning
+    """What is known."""
+    null: Conditioning
+    """That nothing is known."""
+    noise: Float[Tensor, "n 32 h w"]
+    """Noise of every view, on the network's device."""
+    orders: Orders
+    """Orders of the views in windows."""
+    sampling: SamplingConfig
+    """Options."""
+    text: Float[Tensor, "texts words t"] | None = None
+    """The empty prompt, and a prompt if there is one; None for a network without text."""
+    current: Float[Tensor, "n 32 h w"] | None = None
+    """Latents that sampling starts from at a strength below 1."""
+    branches_at_once: int | None = None
+    """Branches of guidance in one batch; None is all."""
+
+    def __post_init__(self) -> None:
+        if self.sampling.strength < 1 and self.current is None:
+            raise ValueError(
+                f"strength: starting at time {self.sampling.strength:g} needs views to start from, got none; pass current views"
+            )
+
+    def run(
+        self, *, on_step: OnStep | None = None, on_trajectory: OnTrajectory | None = None, resume: Trajectory | None = None
+    ) -> Float[Tensor, "n 32 h w"]:
+        """Latents at t = 0."""
+        solver = "euler" if self.sampling.reference_compatible else self.sampling.solver
+        return integrate(
+            self.field(), self.start(), self.sampling.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume
+        )
+
+    def start(self) -> Float[Tensor, "n 32 h w"]:
+        """Where the trajectory starts."""
+        sampling = self.sampling
+        if self.current is None or sampling.strength == 1:
+            return self.noise
+        if sampling.reference_compatible:
+            return reference_started(self.current, self.noise, strength=sampling.strength, steps=sampling.steps)
+        current = self.current
+        if sampling.known == "imposed":
+            current = self.conditioning.channels[:, :STATE_CHANNELS].where(wholly_known(self.conditioning) > 0, current)
+        return started(current, self.noise, sampling.strength)
+
+    def field(self) -> VelocityField:
+        """The guided velocity."""
+        sampling, variant = self.sampling, self.sampling.guidance
+        scale = guidance_map(self.conditioning, known=sampling.guidance_known, unknown=sampling.guidance_unknown)
+        parts, text = branches(self.conditioning, self.null, scale), self.text
+        guides = len(parts) == 2
+        prompted = text is not None and len(text) == 2
+        if text is not None and prompted:
+            text = torch.stack([text[0]] * len(parts) + [text[1]])
+            parts = [*parts, self.conditioning]
+        text_scale = sampling.guidance_text if prompted else None
+        channels = torch.stack([part.channels for part in parts])
+        prepared = Prepared(self.dit, channels, sampling.times[:-1], text=text, branches_at_once=self.branches_at_once)
+        if sampling.reference_compatible:
+            cut = {"window": sampling.window, "rounds": sampling.rounds, "orders": self.orders}
+            return reference_field(prepared, scale, text_scale=text_scale, **cut)
+
+        def cut_up(network: Prepared):
+            return tiled(network, window=sampling.window, rounds=sampling.rounds, orders=self.orders)
+
+        unguided = cut_up(prepared.only(slice(1, None))) if guides and variant.is_limited else None
+        field = guided(cut_up(prepared), scale, text_scale=text_scale, variant=variant, unguided=unguided)
+        if sampling.known == "imposed":
+            field = imposed(field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning))
+        return field

@@ -1,0 +1,88 @@
+"""How a sequence is denoised: the options of `Fillerbuster.complete`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from fb_core.sampling.guidance import GuidanceVariant
+from fb_core.sampling.solvers import SOLVERS
+from fb_core.sampling.time_grids import time_grid
+
+POSE_STEPS, POSE_WINDOW = 8, 8
+"""Steps that raymaps need, and views per window."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig:
+    """How a sequence is denoised, and in how much memory."""
+
+    steps: int = 24
+    """Denoising steps; each evaluates the network once (twice with guidance, three times with a prompt)."""
+    guidance_unknown: float = 7.0
+    """Classifier-free guidance scale where content is unknown (paper: 7)."""
+    guidance_known: float = 1.1
+    """Guidance scale where content is known (paper: 1.1)."""
+    guidance_text: float = 10.0
+    """Guidance scale of a prompt; without a prompt, or at 0, text costs nothing."""
+    guidance: GuidanceVariant = field(default_factory=GuidanceVariant)
+    """Changes to the paper's guidance."""
+    solver: str = "ab2"
+    """'euler', 'heun' (two evaluations a step), 'ab2' (second-order Adams-Bashforth: Euler's error in a third of the steps) or
+    'corrected' (AB2 with a bounded correction, for few steps)."""
+    grid: str = "even"
+    """'even', or the original's 'reference', whose last step is worth nothing."""
+    shift: float = 1.0
+    """Time shift of the grid; above 1 spends more steps near the noise."""
+    strength: float = 1.0
+    """Time at which sampling starts from the `current` views that are given; 1 is pure noise, and they do not matter."""
+    known: str = "guided"
+    """How known content enters: 'guided' by conditioning and guidance alone (paper), or 'imposed', re-imposed on wholly known latents."""
+    window: int | None = None
+    """Views denoised together; None is all of them (best for images; the paper uses 8 for poses)."""
+    rounds: int = 1
+    """Random partitions into windows that are averaged per step."""
+    views_at_once: int | None = None
+    """Views that pass through an autoencoder together; None is as many as memory allows, at most 16."""
+    sample_posterior: bool = False
+    """Condition on samples of the autoencoders' posteriors, as the original does, instead of on their means."""
+    memory_budget_bytes: int | None = None
+    """Most memory, weights included, in bytes; None is what the machine has. Decides how the work is cut (`fb_core.memory`)."""
+    reference_compatible: bool = False
+    """Sample as the original does, with its flaws, for comparisons: Euler on its grid, a guidance map that lands on shuffled views,
+    and a strength that only changes the initial state. `solver`, `grid`, `shift`, `guidance` and `known` do not matter then."""
+
+    def __post_init__(self) -> None:
+        time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver: expected one of {', '.join(SOLVERS)}, got {self.solver!r}")
+        if self.known not in ("guided", "imposed"):
+            raise ValueError(f"known: expected 'guided' or 'imposed', got {self.known!r}")
+        for name in ("rounds", "views_at_once", "window", "memory_budget_bytes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+
+    @property
+    def times(self) -> list[float]:
+        """The times of a sampling, from where it starts to 0."""
+        if self.reference_compatible:
+            return time_grid(self.steps, grid="reference")
+        return time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
+
+    def for_poses(self) -> SamplingConfig:
+        """The budget of recovering raymaps: few steps suffice (docs/speed_and_accuracy.md), in windows of 8 views as in the paper."""
+        return dataclasses.replace(self, steps=min(self.steps, POSE_STEPS), window=self.window or POSE_WINDOW)
+
+    @staticmethod
+    def from_dict(options: Mapping[str, Any]) -> SamplingConfig:
+        """Options as a model folder stores them (what is missing is the default). Raises ValueError for unknown ones."""
+        options = dict(options)
+        unknown = set(options) - {option.name for option in dataclasses.fields(SamplingConfig)}
+        if unknown:
+            raise ValueError(f"sampling options: {', '.join(sorted(unknown))} unknown to this version; update fillerbuster or remove them")
+        if "guidance" in options:
+            options["guidance"] = GuidanceVariant(**options["guidance"])
+        return SamplingConfig(**options)

@@ -1,0 +1,52 @@
+"""Time grids: the descending times from noise (t = 1) to data (t = 0) at which a flow is evaluated.
+
+The best grid depends on the flow (docs/speed_and_accuracy.md), so it is an option and never hard-coded.
+"""
+
+from __future__ import annotations
+
+GRIDS = ("even", "reference")
+REFERENCE_LAST = 0.001
+"""The original's smallest time before 0."""
+
+
+def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: float = 1.0) -> list[float]:
+    """Times from `start` to 0: ``steps + 1`` of them from 1, fewer from a later start.
+
+    Args:
+        steps: steps of the whole way from 1 to 0.
+        shift: t -> s t / (1 + (s - 1) t); above 1 spends more steps near the noise, below 1 more near the data (Esser et al. 2024).
+        grid: "even" is uniform before the shift; "reference" is the original's, evenly from 1 to 0.001 and then 0, whose last step
+            is worth almost nothing.
+        start: where sampling starts, for SDEdit; the steps below it keep their places.
+
+    Raises ValueError for no steps, a shift that is not positive, an unknown grid and a start outside (0, 1].
+    """
+    if steps < 1:
+        raise ValueError(f"sampling steps: expected at least 1, got {steps}")
+    if not shift > 0:
+        raise ValueError(f"time shift: expected a positive number, got {shift}")
+    if grid not in GRIDS:
+        raise ValueError(f"time grid: expected one of {', '.join(GRIDS)}, got {grid!r}")
+    if not 0 < start <= 1:
+        raise ValueError(f"start: expected a time above 0 and at most 1, got {start}")
+    whole = reference_grid(steps) if grid == "reference" else [1.0 - k / steps for k in range(steps + 1)]
+    return _from(start, [shift * t / (1.0 + (shift - 1.0) * t) for t in whole])
+
+
+def reference_grid(steps: int) -> list[float]:
+    """The original's ``steps + 1`` times."""
+    if steps == 1:
+        return [1.0, 0.0]
+    gap = (1.0 - REFERENCE_LAST) / (steps - 1)
+    return [1.0, *(1.0 - k * gap for k in range(1, steps - 1)), REFERENCE_LAST, 0.0]
+
+
+def _from(start: float, times: list[float]) -> list[float]:
+    """The times below `start`, after it. The first step is never a sliver, from which a multistep method would extrapolate noise."""
+    if start >= times[0]:
+        return times
+    later = [time for time in times if time < start]
+    if len(later) > 1 and start - later[0] < (later[0] - later[1]) / 2:
+        later = later[1:]
+    return [start, *later]
