@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from dataclasses import dataclass
 
 import torch
@@ -42,8 +43,8 @@ class Views:
 
     def __getitem__(self, index) -> Views:
         """The chosen views; an integer keeps the leading dimension."""
-        if isinstance(index, int):
-            index = [index]
+        if isinstance(index, numbers.Integral):  # NumPy's integers too
+            index = [int(index)]
         return dataclasses.replace(self, **{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)})
 
     @property

@@ -131,7 +131,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             draws = np.random.default_rng([self.config.completion.seed % 2**63, step])
             if draws.random() < self.generated_probability:
                 chances = np.array(self._bank_shares) / sum(self._bank_shares)
-                return self._generated_batch(int(draws.choice(len(self._bank), p=chances)))
+                return self._generated_batch(self._bank, int(draws.choice(len(self._bank), p=chances)))
         if self.config.train_cameras_sampling_strategy != "random":
             return super().next_train(step)
         _ = self.cached_train  # loads images on first use, and with them train_cameras
@@ -154,12 +154,13 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, data
 
-    def _generated_batch(self, index: int) -> tuple[Cameras, dict]:
-        image = self._bank.images[index]
+    def _generated_batch(self, bank: CompletedViews, index: int) -> tuple[Cameras, dict]:
+        image = bank.images[index]
         if self.config.cache_images_type == "float32":
             image = image.float() / 255
-        batch = {"image": image.to(self.device), "mask": self._bank.masks[index].to(self.device)}
+        batch: dict[str, Any] = {"image": image.to(self.device), "mask": bank.masks[index].to(self.device)}
         batch["view_weight"] = self.config.completion.view_weight
+        assert self._bank_cameras is not None  # is set together with the bank
         return self._bank_cameras[index : index + 1], batch
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict[str, torch.Tensor]]:
@@ -189,7 +190,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
     def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
         started = time.perf_counter()
-        config, splats, trainer = self.config.completion, attributes.pipeline.model, attributes.trainer
+        config, splats, trainer = self.config.completion, _splats_of(attributes), attributes.trainer
         model = self._load_inpainter()
         _ = self.cached_train  # undistortion changes the cameras, so it must come first
         cameras = [camera.to("cpu") for camera in to_pinhole_list(self.train_cameras)]
@@ -211,7 +212,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             torch.cuda.empty_cache()
         added = 0
         if self._bank is not None:
-            added = self._seed_unseen(attributes, plan.shell, cameras, step)
+            added = self._seed_unseen(self._bank, attributes, plan.shell, cameras, step)
             folder = None if trainer is None else Path(trainer.base_dir) / COMPLETION_FOLDER
             if folder is not None:
                 self._bank.save_capture(folder)
@@ -244,22 +245,25 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         data = self.cached_train[index]
         return CapturedView(image=batch_image(data, "cpu"), known=batch_known(data, "cpu"), camera=camera)
 
-    def _seed_unseen(self, attributes: TrainingCallbackAttributes, shell: Shell, cameras: list[Pinholes], step: int) -> int:
-        """Mask and seed what the capture has not seen; returns the number of new Gaussians."""
-        config, splats = self.config.completion, attributes.pipeline.model
+    def _seed_unseen(
+        self, bank: CompletedViews, attributes: TrainingCallbackAttributes, shell: Shell, cameras: list[Pinholes], step: int
+    ) -> int:
+        """Match colours, mask and seed what the capture has not seen; returns the number of new Gaussians."""
+        config, splats = self.config.completion, _splats_of(attributes)
         seeds = config.seed_gaussians and hasattr(splats, "add_gaussians")
         if not seeds and config.generated_pixels == "all":
             return 0
-        rendered = render_geometry(splats, coarse(self._bank.cameras)) if step >= TRAINED_STEPS else None
-        unseen = find_unseen(self._bank, cameras, shell, rendered)
+        rendered = render_geometry(splats, coarse(bank.cameras)) if step >= TRAINED_STEPS else None
+        unseen = find_unseen(bank, cameras, shell, rendered)
         if config.match_colors and rendered is not None:
-            self._set_bank(with_matched_colors(self._bank, unseen, rendered))
+            bank = with_matched_colors(bank, unseen, rendered)
         if config.generated_pixels == "unseen":
-            self._set_bank(with_unseen_masks(self._bank, unseen))
+            bank = with_unseen_masks(bank, unseen)
+        self._set_bank(bank)
         if not seeds:
             return 0
         generator = torch.Generator().manual_seed(config.seed)
-        points, colors = unseen_gaussians(self._bank, unseen, limit=config.max_seed_gaussians, generator=generator)
+        points, colors = unseen_gaussians(bank, unseen, limit=config.max_seed_gaussians, generator=generator)
         if len(points) == 0:
             return 0
         return splats.add_gaussians(points.to(self.device), colors.to(self.device), attributes.optimizers)
@@ -285,6 +289,12 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._finished = bool(state["finished"])
         self._captured_draws = int(state["captured_draws"])
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
+
+
+def _splats_of(attributes: TrainingCallbackAttributes) -> Any:
+    """The splat model that is being trained."""
+    assert attributes.pipeline is not None  # nerfstudio's trainer always gives it
+    return attributes.pipeline.model
 
 
 class _Bars:

@@ -89,7 +89,7 @@ def _lens(cameras: Cameras, index: int) -> tuple[str, dict[str, float]] | None:
     if model is None:
         return None
     values = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
-    distortion = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), values, strict=True))
+    distortion: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), values, strict=True))
     try:
         check_lens(model, distortion, "start_points")
     except ValueError:

@@ -68,8 +68,9 @@ class CompletionPanel(ViewerControl):
             self._switches.pop(name).remove()
             for handle in reversed(self._groups.pop(name)):
                 handle.remove()
-        for number in [] if self.views is None else self.views.rounds:
-            self._draw_round(number, self.views.of_round(number))
+        if self.views is not None:
+            for number in self.views.rounds:
+                self._draw_round(number, self.views.of_round(number))
         self._write_status()
 
     def _draw_round(self, number: int, views: CompletedViews) -> None:
@@ -85,12 +86,15 @@ class CompletionPanel(ViewerControl):
         from viser import transforms
 
         camera = views.cameras[index].to("cpu")
+        scale = _FRUSTUM_SHARE * spacing(self.views or views) * VISER_NERFSTUDIO_SCALE_RATIO
         stride = max(1, -(-max(camera.width, camera.height) // _LARGEST_PICTURE))
         handle = self.viser_server.scene.add_camera_frustum(
             node,
             fov=float(2 * np.arctan(camera.height / 2 / float(camera.focal[0, 1]))),
             aspect=camera.width / camera.height,
-            scale=max(self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(self.views) * VISER_NERFSTUDIO_SCALE_RATIO),
+            scale=max(
+                self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(self.views or views) * VISER_NERFSTUDIO_SCALE_RATIO
+            ),
             color=_COLORS[views.origins[index].round % len(_COLORS)],
             image=views.images[index, ::stride, ::stride].cpu().numpy(),
             wxyz=transforms.SO3.from_matrix(camera.rotations[0].double().numpy()).wxyz,  # frustums have OpenCV axes, as ours

@@ -65,7 +65,8 @@ def _steps_planned(recipe: Recipe, stage: str) -> int:
 def _steps_done(folder: Path) -> int:
     """Steps that the stage's checkpoint has behind it; 0 without one."""
     path = folder / "checkpoint.pt"
-    return torch.load(path, weights_only=True, map_location="cpu", mmap=True)["step"] if path.exists() else 0
+    complete = path.exists() and (folder.name == "dit" or (folder / "spread.json").exists())  # killed while measuring its latents
+    return torch.load(path, weights_only=True, map_location="cpu", mmap=True)["step"] if complete else 0
 
 
 def _require_positive(**values: float | None) -> None:

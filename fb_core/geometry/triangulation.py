@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -55,7 +56,7 @@ def detect(image: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"] | None =
 
     pixels = np.ascontiguousarray((image.clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).numpy())
     mask = None if known is None else np.ascontiguousarray((known[0] > 0).to(torch.uint8).numpy() * 255)
-    sift = cv2.SIFT_create(nfeatures=limit, contrastThreshold=0.01)
+    sift: Any = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.01)
     places, descriptors = sift.detectAndCompute(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), mask)
     if not places:
         return torch.zeros(0, 2), torch.zeros(0, 128), torch.zeros(0, 3)

@@ -6,6 +6,8 @@ of steps to get there; starting from that codec, training only has to add what a
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import torch
 from torch import Tensor, nn
 
@@ -31,7 +33,7 @@ def start_linear(network: VAE, generator: torch.Generator) -> VAE:
     average[:2, :2] = 0.25
     delta = torch.zeros(3, 3)
     delta[1, 1] = 1.0
-    encoder, decoder = network.encoder, network.decoder
+    encoder, decoder = cast(Any, network.encoder), cast(Any, network.decoder)  # lists of blocks, which nn.Module hides from type checkers
     for level in encoder.down_blocks:
         for step in level.downsamplers:
             _pass(step.conv, average, channels)
@@ -47,7 +49,7 @@ def start_linear(network: VAE, generator: torch.Generator) -> VAE:
     _pass(network.quant_conv, point, channels)
     _pass(network.post_quant_conv, point, channels)
     network.quant_conv.weight[config.latent_channels :] = 0
-    network.quant_conv.bias[config.latent_channels :] = _LOG_VARIANCE
+    cast(Tensor, network.quant_conv.bias)[config.latent_channels :] = _LOG_VARIANCE
     # The closing SiLU of each half works at its linear point: shifted there by the last layer before it, shifted back after it.
     for before, after in ((encoder.mid_block.resnets[1], encoder.conv_out), (decoder.up_blocks[-1].resnets[-1], decoder.conv_out)):
         before.conv2.bias[:channels] += _LINEAR_POINT

@@ -27,8 +27,11 @@ OnProgress = Callable[[int, int, dict[str, float]], None]
 class Stage(Protocol):
     """One thing that is trained: a network and the loss of a step."""
 
-    name: str
-    network: nn.Module
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def network(self) -> nn.Module: ...
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Losses of step ``step``; the entry ``loss`` is what is minimised. Deterministic in the step."""

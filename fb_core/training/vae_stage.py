@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from fb_core.data.sequences import RoomPool, TaskConfig
 from fb_core.geometry.raymap import to_unit_range
@@ -37,7 +37,9 @@ class VAEStage:
     def __init__(self, network: VAE, pool: RoomPool, *, kind: str, config: VAELossConfig, seed: int):
         if kind not in ("image-vae", "raymap-vae"):
             raise ValueError(f"autoencoder: expected 'image-vae' or 'raymap-vae', got {kind!r}")
-        self.name, self.network, self.pool, self.config, self.seed = kind, network, pool, config, seed
+        self.name: str = kind
+        self.network: VAE = network
+        self.pool, self.config, self.seed = pool, config, seed
         # Raymaps are seen under every heading and scale: the autoencoder must not know the frame.
         self._task = TaskConfig(views=min(4, pool.config.views), random_heading=True, random_fill=True)
 
@@ -64,7 +66,7 @@ class VAEStage:
 
 
 @torch.no_grad()
-def reconstruction_error(network: nn.Module, values: Float[Tensor, "b c h w"]) -> dict[str, float]:
+def reconstruction_error(network: VAE, values: Float[Tensor, "b c h w"]) -> dict[str, float]:
     """How well values in [0, 1] survive: PSNR in dB for images, degrees and cube units for raymaps."""
     decoded = network.decode(network.encode(values), clamp=True)
     if values.shape[1] == 3:
