@@ -92,9 +92,7 @@ class CompletionPanel(ViewerControl):
             node,
             fov=float(2 * np.arctan(camera.height / 2 / float(camera.focal[0, 1]))),
             aspect=camera.width / camera.height,
-            scale=max(
-                self.viewer.config.camera_frustum_scale, _FRUSTUM_SHARE * spacing(self.views or views) * VISER_NERFSTUDIO_SCALE_RATIO
-            ),
+            scale=max(self.viewer.config.camera_frustum_scale, scale),
             color=_COLORS[views.origins[index].round % len(_COLORS)],
             image=views.images[index, ::stride, ::stride].cpu().numpy(),
             wxyz=transforms.SO3.from_matrix(camera.rotations[0].double().numpy()).wxyz,  # frustums have OpenCV axes, as ours
