@@ -56,6 +56,8 @@ class CompletionConfig:
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says nothing)."""
     guidance_known: float | None = None
     """Guidance scale in known pixels; None is what the model's folder recommends (the paper's 1.1 where it says nothing)."""
+    memory_budget: float | None = None
+    """Most memory that a pass of the model may take, weights included, in GiB; None is what the machine has. The work is cut to fit."""
     seed: int = 0
     """Decides cameras, images, and which training steps draw generated views."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
@@ -88,10 +90,14 @@ class CompletionConfig:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         if not 0.0 <= self.generated_share <= 1.0:
             raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
+        if self.memory_budget is not None and not self.memory_budget > 0:
+            raise ValueError(f"completion.memory_budget: expected a positive number of GiB, got {self.memory_budget}")
         if self.view_weight < 0:
             raise ValueError(f"completion.view_weight: expected 0 or more, got {self.view_weight}")
 
     def sampling(self, recommended: SamplingConfig = SamplingConfig()) -> SamplingConfig:
         """How to sample: these options where they are given, the model's recommendation elsewhere."""
         given = {name: getattr(self, name) for name in ("steps", "guidance_unknown", "guidance_known") if getattr(self, name) is not None}
+        if self.memory_budget is not None:
+            given["memory_budget_bytes"] = int(self.memory_budget * 2**30)
         return dataclasses.replace(recommended, **given)

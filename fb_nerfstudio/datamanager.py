@@ -200,7 +200,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             CONSOLE.print(announcement(plan, config, model, done=self._bank))
             context = [self._captured_view(index, cameras[index]) for index in plan.context]
             left = len(plan.rounds) - (0 if self._bank is None else len(self._bank.rounds))
-            with _Bars(self.completion_panel, len(plan.rounds)) as bars:
+            with _Bars(self.completion_panel, len(plan.rounds)) as bars, _refusing():
                 for views in run_completion(plan, context, model, config, done=self._bank, on_step=bars.step):
                     left -= 1
                     self._set_bank(views if self._bank is None else CompletedViews.cat([self._bank, views]))
@@ -289,6 +289,15 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._finished = bool(state["finished"])
         self._captured_draws = int(state["captured_draws"])
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """A sentence instead of a traceback for what the model refuses, such as too small a memory budget."""
+    try:
+        yield
+    except ValueError as error:
+        raise Refused(str(error)) from None
 
 
 def _splats_of(attributes: TrainingCallbackAttributes) -> Any:

@@ -34,7 +34,7 @@ def start_points(outputs: DataparserOutputs, *, count: int, seed: int) -> tuple[
 
     Args:
         outputs: a dataparser's train split; files are read at their own size.
-        count: fewest points; triangulated ones are never thrown away.
+        count: at most as many with the filling (masked pixels give none); triangulated points are never thrown away.
         seed: draws the filling.
     """
     photos = [photo for index in range(len(outputs.image_filenames)) if (photo := _Photo.of(outputs, index)) is not None]

@@ -168,6 +168,29 @@ def test_batches_have_what_the_splat_model_reads(tiny_capture: Path):
     assert batch["image"].dtype == torch.uint8 and batch["image"].shape == (32, 48, 3) and "view_weight" not in batch
 
 
+def test_a_memory_budget_reaches_the_sampler_and_what_does_not_fit_is_one_sentence(tiny_capture: Path, monkeypatch):
+    assert options(memory_budget=1.5).sampling().memory_budget_bytes == 3 * 2**29
+    with pytest.raises(ValueError, match=r"completion\.memory_budget"):
+        options(memory_budget=0.0)
+
+    def too_small(self, views, *, generator, sampling, on_step=None):
+        raise ValueError(f"memory budget of {sampling.memory_budget_bytes} bytes: too small; 4 views would fit")
+
+    monkeypatch.setattr(GreyFiller, "complete", too_small)
+    with pytest.raises(Refused, match="4 views would fit"):
+        generated(make(tiny_capture, options(memory_budget=1.5)))
+
+
+def test_a_capture_without_points_starts_from_its_photos(tiny_capture: Path):
+    manager = make(tiny_capture, points=False, start_points=50)
+    metadata = manager.train_dataparser_outputs.metadata
+    assert 30 <= len(metadata["points3D_xyz"]) <= 50 and metadata["points3D_rgb"].dtype == torch.uint8
+    assert metadata["points3D_xyz"].shape == metadata["points3D_rgb"].shape and bool(metadata["points3D_xyz"].isfinite().all())
+    again = make(tiny_capture, points=False, start_points=50).train_dataparser_outputs.metadata
+    assert torch.equal(metadata["points3D_xyz"], again["points3D_xyz"])
+    assert "points3D_xyz" not in make(tiny_capture, points=False, start_points=0).train_dataparser_outputs.metadata
+
+
 def test_float_caches_give_float_generated_images(tiny_capture: Path):
     manager = make(tiny_capture, options(generated_share=1.0), cache_images_type="float32")
     generated(manager)
