@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 _WIDEST_TABLE = 8
-_ALWAYS_SHOWN = ("views", "size", "steps", "parameters", "relative_difference")
+_ALWAYS_SHOWN = ("scene", "peer", "views", "size", "steps", "parameters", "relative_difference")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,8 @@ from typing import Annotated, Literal
 import tyro
 
 from method_configs.bench_command import Networks, Precision
+from method_configs.bench_fit import Fit
+from method_configs.bench_splat import Splat
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -130,7 +132,10 @@ def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path(
 def bench(
     *,
     benchmark: tyro.conf.OmitArgPrefixes[
-        Annotated[Networks, tyro.conf.subcommand("networks")] | Annotated[Precision, tyro.conf.subcommand("precision")]
+        Annotated[Networks, tyro.conf.subcommand("networks")]
+        | Annotated[Precision, tyro.conf.subcommand("precision")]
+        | Annotated[Splat, tyro.conf.subcommand("splat")]
+        | Annotated[Fit, tyro.conf.subcommand("fit")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
