@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import sys
+from collections.abc import Callable
 from types import ModuleType
 
 import pytest
@@ -50,29 +51,76 @@ def test_the_semantics_follow_the_installed_gsplat(monkeypatch, version: str, se
         installed_semantics.cache_clear()
 
 
-def test_gsplat_takes_every_keyword_that_is_passed(monkeypatch):
-    """The CUDA branch, with gsplat's own signature in front of a recorder (no kernel runs)."""
-    from gsplat.rendering import rasterization as gsplat_rasterization
+# What gsplat's rasterization can be called with, from its releases; the installed one is asked itself.
+COMMON = (
+    "means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree packed tile_size "
+    "backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed camera_model"
+).split()
+KEYWORDS = {
+    "1.4": [*COMMON, "covars"],
+    "1.5": [*COMMON, *"segmented covars with_ut with_eval3d radial_coeffs tangential_coeffs thin_prism_coeffs rolling_shutter".split()],
+    "installed": None,
+}
 
-    signature, seen = inspect.signature(gsplat_rasterization), {}
 
-    def recorder(*args, **kwargs):
+class OnCuda(Tensor):
+    """A tensor of the CPU that says it were on a GPU."""
+
+    device = torch.device("cuda")
+
+
+def recorder(version: str, seen: dict) -> Callable[..., tuple]:
+    """A stand-in for gsplat's rasterization that takes what this version takes, and keeps it."""
+    names = KEYWORDS[version]
+    if names is None:
+        from gsplat.rendering import rasterization as installed
+
+        signature = inspect.signature(installed)
+    else:
+        required, kind = COMMON.index("near_plane"), inspect.Parameter.POSITIONAL_OR_KEYWORD
+        empty = inspect.Parameter.empty
+        signature = inspect.Signature(
+            [inspect.Parameter(name, kind, default=empty if place < required else None) for place, name in enumerate(names)]
+        )
+
+    def rasterize(*args, **kwargs):
         seen.update(signature.bind(*args, **kwargs).arguments)
-        return torch.zeros(1, 24, 32, 7), torch.zeros(1, 24, 32, 1), {"radii": 0}
+        cameras, channels = len(seen["viewmats"]), seen["colors"].shape[-1] + (seen["render_mode"] == "RGB+ED")
+        radii = torch.zeros(cameras, 20) if version == "1.4" else torch.zeros(cameras, 20, 2)
+        return torch.zeros(cameras, 24, 32, channels), torch.zeros(cameras, 24, 32, 1), {"radii": radii}
 
+    return rasterize
+
+
+@pytest.mark.parametrize("version", KEYWORDS)
+@pytest.mark.parametrize("normals", [False, True])
+def test_on_cuda_it_is_gsplat_with_keywords_that_each_version_takes(monkeypatch, version: str, normals: bool):
+    """No kernel runs here: the call is bound to the version's signature. Normals are three more channels, on either backend."""
+    seen: dict = {}
     fake = ModuleType("gsplat.rendering")
-    fake.rasterization = recorder
+    fake.rasterization = recorder(version, seen)
     monkeypatch.setitem(sys.modules, "gsplat.rendering", fake)
-
-    class OnCuda(Tensor):
-        device = torch.device("cuda")
-
     inputs = splats()
     inputs["means"] = inputs["means"].as_subclass(OnCuda)
+    inputs["colors"] = inputs["colors"] if normals else inputs["colors"][:, :3]
     rendered = render_splats(**inputs, absgrad=True, rasterize_mode="antialiased", render_mode="RGB+ED", sh_degree=None)
-    assert rendered.meta == {"radii": 0}
+    assert rendered.colors.shape == (1, 24, 32, 7 if normals else 4) and rendered.meta["radii"].shape[:2] == (1, 20)
     assert seen["packed"] is False and seen["absgrad"] is True and seen["rasterize_mode"] == "antialiased"
     assert set(splats()) <= set(seen)
+    assert render_splats(**{**inputs, "means": splats()["means"]}, render_mode="RGB+ED").colors.shape == rendered.colors.shape
+
+
+def test_mps_takes_the_detour_over_the_cpu(monkeypatch):
+    class OnMps(Tensor):
+        device = torch.device("mps")
+
+    called = []
+    monkeypatch.setattr(splat_backend, "_through_cpu", lambda splats, options, backgrounds: called.append((splats, options)))
+    inputs = splats()
+    inputs["means"] = inputs["means"].as_subclass(OnMps)
+    render_splats(**inputs)
+    ((tensors, options),) = called
+    assert set(tensors) | set(options) >= set(splats())
 
 
 def test_the_cpu_detour_gives_pictures_gradients_and_absgrad_and_says_so_once(caplog):
