@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 _WIDEST_TABLE = 8
-_ALWAYS_SHOWN = ("scene", "peer", "views", "size", "steps", "parameters", "relative_difference")
+_ALWAYS_SHOWN = (
+    *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
+    *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ import tyro
 
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
+from method_configs.bench_poses import Poses
 from method_configs.bench_splat import Splat
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
@@ -134,6 +135,7 @@ def bench(
     benchmark: tyro.conf.OmitArgPrefixes[
         Annotated[Networks, tyro.conf.subcommand("networks")]
         | Annotated[Precision, tyro.conf.subcommand("precision")]
+        | Annotated[Poses, tyro.conf.subcommand("poses")]
         | Annotated[Splat, tyro.conf.subcommand("splat")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
     ],

@@ -35,12 +35,13 @@ def normals_from_depth(depth: Float[Tensor, "n h w"], cameras: Pinholes) -> Floa
         raise ValueError(f"depth: expected a shape {expected} like the cameras (number, height, width), got {tuple(depth.shape)}")
     in_plane = (cameras.pixel_centers() - cameras.principal[:, None, None]) / cameras.focal[:, None, None]
     usable = depth.isfinite() & (depth > 0)
-    # Normals do not depend on the unit of length; a depth near one keeps the products of differences far from underflow.
-    mean = torch.where(usable, depth, 0.0).detach().sum(dim=(1, 2), keepdim=True) / usable.sum(dim=(1, 2), keepdim=True).clamp_min(1)
-    filled = torch.where(usable, depth / torch.where(mean > 0, mean, 1.0), 1.0)
+    filled = torch.where(usable, depth, 1.0)
     points = torch.cat([in_plane, torch.ones_like(in_plane[..., :1])], dim=-1) * filled[..., None]
-    across = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
-    upward = points[:, :-2, 1:-1] - points[:, 2:, 1:-1]
+    reach = filled.detach()[..., None]
+    # The length of either difference changes nothing. In units of their own depth their product stays far from underflow, however near
+    # this surface and however far another one in the picture.
+    across = (points[:, 1:-1, 2:] - points[:, 1:-1, :-2]) / torch.maximum(reach[:, 1:-1, 2:], reach[:, 1:-1, :-2])
+    upward = (points[:, :-2, 1:-1] - points[:, 2:, 1:-1]) / torch.maximum(reach[:, :-2, 1:-1], reach[:, 2:, 1:-1])
     normals = unit_or_zero(torch.linalg.cross(across, upward))
     supported = usable[:, 1:-1, 1:-1] & usable[:, 1:-1, 2:] & usable[:, 1:-1, :-2] & usable[:, :-2, 1:-1] & usable[:, 2:, 1:-1]
     normals = torch.where(supported[..., None], normals, 0.0)
