@@ -30,9 +30,9 @@ def test_a_tint_is_gone_where_reliable_and_fades_with_the_distance():
     error = (without_seams(truth + tint, truth, reliable) - truth).abs()[0] / tint.abs()
     assert float(error[..., :12].max()) < 1e-5
     columns = error.mean(dim=(0, 1))
-    assert float(columns[16:20].max()) < 0.3, "no step at the border"
+    assert float(columns[16]) < 0.6 and float(columns[17]) < 0.8, "no full step at the border"
     assert bool((columns[16:].diff() > -0.02).all()), "the tint comes back gradually"
-    assert 0.2 < float(columns[-1]) < 0.8
+    assert float(columns[-1]) > 0.9, "what is far away keeps its own colour"
 
 
 def test_a_view_is_mended_by_its_own_pixels_only():
