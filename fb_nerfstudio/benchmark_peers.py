@@ -88,6 +88,16 @@ def gsplat_torch(
         )  # fmt: skip
 
 
+def gsplat_kernels(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
+) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
+    """The same by gsplat's CUDA kernels; the tensors must be on a GPU."""
+    from gsplat import rendering
+
+    splats: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
+    return rendering.rasterization(**splats, width=width, height=height, packed=False, render_mode="RGB+D")[:2]
+
+
 @torch.no_grad()
 def _tile_lists(view: dict[str, Tensor], width: int, height: int) -> tuple[Tensor, Tensor]:
     """gsplat's tile lists without its Python loop: offsets [1, rows, columns] and Gaussians by tile, near ones first."""

@@ -42,9 +42,9 @@ class SplatScene:
     width: int
     height: int
 
-    def inputs(self, dtype: torch.dtype = torch.float32, *, gradients: bool = False) -> dict[str, Any]:
+    def inputs(self, dtype: torch.dtype = torch.float32, *, gradients: bool = False, device: torch.device | str = "cpu") -> dict[str, Any]:
         """Fresh keyword arguments for a rasterization; with ``gradients`` the Gaussians are leaves that want some."""
-        tensors = {name: getattr(self, name).to(dtype, copy=True) for name in (*LEAVES, "viewmats", "Ks")}
+        tensors = {name: getattr(self, name).to(device, dtype, copy=True) for name in (*LEAVES, "viewmats", "Ks")}
         if gradients:
             tensors |= {name: tensors[name].requires_grad_() for name in LEAVES}
         return {**tensors, "width": self.width, "height": self.height}

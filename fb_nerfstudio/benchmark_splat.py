@@ -22,7 +22,7 @@ from torch import Tensor
 
 from fb_core.evaluation.benchmarks import Bar, OnCell, Report
 from fb_nerfstudio import torch_compositing
-from fb_nerfstudio.benchmark_peers import gsplat_torch, tile_loop
+from fb_nerfstudio.benchmark_peers import gsplat_kernels, gsplat_torch, tile_loop
 from fb_nerfstudio.benchmark_scenes import LEAVES, SplatScene, capture_scene, room_scene
 from fb_nerfstudio.single_thread import single_thread
 from fb_nerfstudio.torch_rasterizer import rasterization
@@ -67,12 +67,12 @@ QUICK = SplatBenchmark(cells=((300, 32),), runs=1, peer_runs=1)
 
 
 def run_splat(config: SplatBenchmark = SplatBenchmark(), *, on_cell: OnCell = lambda _: None) -> Report:
-    """Parts of the report: ours, peers, work (how much there is to do, and the floor), machine (best runs, how fast it was just then)."""
+    """Parts of the report: ours, peers, work (how much there is to do, and the floor), machine (best runs, its speed just then), gpu."""
     report = Report(seed=config.seed)
     scenes: list[Callable[[], SplatScene]] = [lambda c=count, s=size: room_scene(c, s, seed=config.seed) for count, size in config.cells]
     if config.capture is not None:
         scenes.append(lambda: capture_scene(config.capture, seed=config.seed))  # type: ignore[arg-type]
-    parts: dict[str, list[dict[str, Any]]] = {"ours": [], "peers": [], "work": [], "machine": []}
+    parts: dict[str, list[dict[str, Any]]] = {"ours": [], "peers": [], "work": [], "machine": [], "gpu": []}
     with single_thread():
         for make in scenes:
             scene = make()
@@ -110,6 +110,8 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
             "forward_ratio": slow_forward / forward, "both_ratio": slow_both / both, **values,
         })  # fmt: skip
     parts["work"].append(_work(scene, forward))
+    if torch.cuda.is_available():
+        parts["gpu"].append(_kernels(scene, exact, "cuda", config.runs))
     parts["machine"].append({
         "part": "machine", "scene": scene.name, "best_forward_seconds": min(taken[0] for taken in times["ours"]),
         "best_both_seconds": min(taken[1] for taken in times["ours"]),
@@ -150,11 +152,37 @@ def _seconds_without_gradients(scene: SplatScene) -> float:
     return time.process_time() - begin
 
 
-def _picture_and_gradients(draw: Draw, scene: SplatScene, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    inputs = scene.inputs(dtype, gradients=True)
+def _picture_and_gradients(
+    draw: Draw, scene: SplatScene, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> dict[str, Tensor]:
+    inputs = scene.inputs(dtype, gradients=True, device=device)
     images, alphas = draw(**inputs)
     _loss(images, alphas).backward()
-    return {"picture": images[..., :3].detach(), **{name: inputs[name].grad for name in LEAVES}}
+    return {"picture": images[..., :3].detach().cpu(), **{name: inputs[name].grad.cpu() for name in LEAVES}}
+
+
+def _kernels(scene: SplatScene, exact: dict[str, Tensor], device: str, runs: int) -> dict[str, Any]:
+    """gsplat's own kernels against our float64 picture and gradients, and their wall-clock time."""
+    errors = _errors(_picture_and_gradients(gsplat_kernels, scene, device=device), exact)
+    inputs = scene.inputs(gradients=True, device=device)
+    taken = []
+    for _ in range(runs + 1):
+        times = [time.perf_counter()]
+        images, alphas = gsplat_kernels(**inputs)
+        _finish(times)
+        loss = _loss(images, alphas)
+        _finish(times)
+        loss.backward()
+        _finish(times)
+        taken.append((times[1] - times[0], times[1] - times[0] + times[3] - times[2]))
+    forward, both = (statistics.median(part) for part in zip(*taken[1:], strict=True))  # the first may compile
+    return {"part": "gpu", "scene": scene.name, "forward_seconds": forward, "both_seconds": both, **errors}
+
+
+def _finish(times: list[float]) -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    times.append(time.perf_counter())
 
 
 def _errors(got: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, float]:

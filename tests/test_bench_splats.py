@@ -78,6 +78,32 @@ def test_gsplat_is_left_as_it_was():
     assert before == (_wrapper.rasterize_to_indices_in_range, nerfacc.render_weight_from_alpha)
 
 
+def test_the_row_of_gsplats_kernels_in_miniature(monkeypatch):
+    """No kernel runs here: ours stands in for gsplat's function, so the row must say that both are equal."""
+    from gsplat import rendering
+
+    def stand_in(**arguments):
+        assert arguments["packed"] is False
+        return rasterization(**arguments)
+
+    monkeypatch.setattr(rendering, "rasterization", stand_in)
+    scene = room_scene(100, 24)
+    exact = benchmark_splat._picture_and_gradients(benchmark_splat._ours, scene, torch.float64)
+    row = benchmark_splat._kernels(scene, exact, "cpu", 1)
+    assert row["mean_error"] < 1e-6 and row["gradient_error"] < 1e-4 and row["both_seconds"] > row["forward_seconds"] > 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU and gsplat's kernels")
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "size"), [(10_000, 256), (50_000, 512)])
+def test_gsplats_kernels_agree_with_ours(count: int, size: int):
+    """Means over pixels and norms of gradients: at a handful of pixels float32 decides a threshold the other way."""
+    scene = room_scene(count, size)
+    exact = benchmark_splat._picture_and_gradients(benchmark_splat._ours, scene, torch.float64)
+    row = benchmark_splat._kernels(scene, exact, "cuda", 1)
+    assert row["mean_error"] < 1e-5 and row["gradient_error"] < 1e-2
+
+
 def test_splat_in_miniature(tmp_path):
     commands.main(["bench", "splat", "--quick", "--json", str(tmp_path / "s.json")])
     content = json.loads((tmp_path / "s.json").read_text())
