@@ -202,6 +202,13 @@ class Fillerbuster:
         _logger.debug("%d views of %dx%d: %.2f GiB, %s", views, size[1], size[0], expected.peak / 2**30, expected.cut)
         return expected.cut
 
+    def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig = SamplingConfig()) -> Denoising:
+        """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
+        _check(views)
+        padded = _padded(views.to(self.device))
+        cut = self._cut(len(views), views.size, sampling, None)
+        return self._denoising(padded, _frame_of(padded), None, self._text_of(None), seed, sampling, cut)
+
     def _denoising(
         self,
         views: Views,

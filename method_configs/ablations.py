@@ -26,7 +26,7 @@ ROOMS_TINY = Recipe(
     raymap_vae_loss=VAELossConfig(batch=16),
     # Heading and fill as at inference: a small model has none to spare for what the canonical frame can settle.
     # Guidance over-saturates what so small a model is unsure of (the paper uses 7); without it a step also costs half.
-    sampling=SamplingConfig(guidance_unknown=1.0, guidance_known=1.0),
+    sampling=SamplingConfig(guidance_unknown=1.0, guidance_known=1.0, shift=1.0),
     dit_loss=DiTLossConfig(batch=8, task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False), ray_weight=0.3),
 )
 """The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about an hour and a half."""

@@ -19,6 +19,7 @@ import tyro
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
+from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
@@ -135,6 +136,7 @@ def bench(
     benchmark: tyro.conf.OmitArgPrefixes[
         Annotated[Networks, tyro.conf.subcommand("networks")]
         | Annotated[Precision, tyro.conf.subcommand("precision")]
+        | Annotated[Sampler, tyro.conf.subcommand("sampler")]
         | Annotated[Poses, tyro.conf.subcommand("poses")]
         | Annotated[Splat, tyro.conf.subcommand("splat")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]

@@ -149,3 +149,128 @@ def test_bad_views_are_refused_with_one_sentence(model):
 def test_nonsense_sampling_is_refused(nonsense):
     with pytest.raises(ValueError, match="expected"):
         SamplingConfig(**nonsense)
+
+
+# Options of sampling -----------------------------------------------------------------------------------------------
+
+
+def current_views() -> Views:
+    """Whole views that are not those of `mixed_views`."""
+    return Views.known(torch.rand(5, 3, 32, 32, generator=seeded(11)), cameras(5))
+
+
+def test_the_same_call_gives_the_same_bits_whatever_ran_before(model):
+    views, sampling = mixed_views(2, 1, 2), dataclasses.replace(QUICK, window=3, rounds=2, sample_posterior=True)
+    wanted = model.complete(views, generator=seeded(), sampling=sampling)
+    torch.randn(7)
+    model.complete(mixed_views(1, 0, 3), generator=seeded(5), sampling=QUICK)
+    torch.manual_seed(99)
+    got = model.complete(views, generator=seeded(), sampling=sampling)
+    assert torch.equal(got.images, wanted.images) and torch.equal(got.raymaps, wanted.raymaps)
+
+
+def test_a_view_more_leaves_the_others_alone_when_views_do_not_see_each_other(model):
+    """Windows of one view: noise, posterior and prediction of a view depend on nothing else. (The last view has nothing known.)"""
+    views, sampling = mixed_views(2, 1, 2), dataclasses.replace(QUICK, window=1, sample_posterior=True)
+    fewer = model.complete(views[:4], generator=seeded(), sampling=sampling).images
+    assert torch.allclose(model.complete(views, generator=seeded(), sampling=sampling).images[:4], fewer, atol=1e-5)
+
+
+def test_a_low_strength_stays_near_the_current_views_and_a_high_one_does_not(model):
+    views, current = mixed_views(1, 0, 4), current_views()
+
+    def done(strength: float) -> torch.Tensor:
+        sampling = SamplingConfig(steps=6, guidance_unknown=1.0, strength=strength)
+        return model.complete(views, generator=seeded(), sampling=sampling, current=current).images
+
+    through_the_autoencoder = done(1e-6)
+    distances = [float((done(strength) - through_the_autoencoder)[1:].abs().mean()) for strength in (0.003, 0.3, 0.9)]
+    assert distances[0] < 0.2 * distances[2] and distances[0] < distances[1] < distances[2]
+    assert torch.equal(done(0.3)[0], views.images[0]), "known views stay as given"
+
+
+def test_strength_costs_only_the_steps_that_are_left(model):
+    seen = []
+    sampling = SamplingConfig(steps=10, strength=0.5)
+    model.complete(mixed_views(), generator=seeded(), sampling=sampling, current=current_views(), on_step=lambda *at: seen.append(at))
+    assert seen[-1] == (5, 5)
+
+
+def test_bad_current_views_are_refused(model):
+    sampling = SamplingConfig(steps=2, strength=0.5)
+    with pytest.raises(ValueError, match="needs views to start from"):
+        model.complete(mixed_views(), generator=seeded(), sampling=sampling)
+    with pytest.raises(ValueError, match="current: expected 5 views of 32x32"):
+        model.complete(mixed_views(), generator=seeded(), sampling=sampling, current=current_views()[:3])
+    broken = dataclasses.replace(current_views(), images=torch.full((5, 3, 32, 32), torch.nan))
+    with pytest.raises(ValueError, match="current: pixels or rays are NaN"):
+        model.complete(mixed_views(), generator=seeded(), sampling=sampling, current=broken)
+
+
+@pytest.mark.parametrize("options", [{"solver": "corrected"}, {"window": 3, "rounds": 2}, {"reference_compatible": True}])
+def test_an_interrupted_completion_goes_on_to_the_same_bits(model, options):
+    views, sampling = mixed_views(), dataclasses.replace(QUICK, steps=4, **options)
+
+    def stop(done, of):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    whole = model.complete(views, generator=seeded(), sampling=sampling)
+    with pytest.raises(KeyboardInterrupt, match="stopped after 2 of 4 steps") as stopped:
+        model.complete(views, generator=seeded(), sampling=sampling, on_step=stop)
+    rest = []
+    resumed = model.complete(
+        views, generator=seeded(77), sampling=sampling, resume=stopped.value, on_step=lambda done, of: rest.append(done)
+    )
+    assert rest == [3, 4] and torch.equal(resumed.images, whole.images) and torch.equal(resumed.raymaps, whole.raymaps)
+    assert torch.equal(model.complete(views, generator=seeded(), sampling=sampling).images, whole.images), "the model is as it was"
+
+
+def test_progress_tells_step_time_and_a_cheap_preview(model):
+    seen = []
+    model.complete(mixed_views(), generator=seeded(), sampling=dataclasses.replace(QUICK, steps=4), on_progress=seen.append)
+    assert [(at.step, at.steps, at.time) for at in seen] == [(1, 4, 0.75), (2, 4, 0.5), (3, 4, 0.25), (4, 4, 0.0)]
+    preview = seen[-1].preview()
+    assert preview.shape == (5, 3, 4, 4) and 0 <= preview.min() and preview.max() <= 1
+    assert seen[-1].latents.shape == (5, 32, 4, 4)
+
+
+def test_a_preview_looks_like_the_decoded_views():
+    """The bundled autoencoder: the matrix explains most of what a decoding explains."""
+    import torch.nn.functional as F
+
+    from fb_core.sampling.preview import LatentColors
+
+    vae = Fillerbuster.from_pretrained().image_vae
+    coarse = torch.rand(6, 3, 3, 3, generator=seeded(8))
+    pictures = F.interpolate(coarse, size=(64, 64), mode="bicubic", align_corners=True).clamp(0, 1)
+    with torch.no_grad():
+        preview = LatentColors.of(vae)(vae.encode(pictures))
+    wanted = F.avg_pool2d(pictures, 8)
+    assert (preview - wanted).square().mean() < 0.1 * wanted.var()
+
+
+def test_known_latents_may_be_imposed(model):
+    views = mixed_views()
+    plain = model.complete(views, generator=seeded(), sampling=QUICK)
+    imposed = model.complete(views, generator=seeded(), sampling=dataclasses.replace(QUICK, known="imposed"))
+    assert torch.equal(imposed.images * views.image_known, views.images * views.image_known)
+    assert not torch.equal(imposed.images, plain.images)
+
+
+def test_reference_compatible_is_the_original_s_way_not_ours(model):
+    views = mixed_views()
+    options = {"steps": 3, "guidance_unknown": 7.0}
+    original = model.complete(views, generator=seeded(), sampling=SamplingConfig(reference_compatible=True, **options))
+    same_grid = model.complete(views, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", **options))
+    assert not torch.allclose(original.images, same_grid.images, atol=1e-3), "the guidance map lands on other views"
+    even = {"steps": 3, "guidance_unknown": 2.0, "guidance_known": 2.0}
+    one_view = mixed_views(0, 1, 0)
+    original = model.complete(one_view, generator=seeded(), sampling=SamplingConfig(reference_compatible=True, **even))
+    same_grid = model.complete(one_view, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", **even))
+    assert torch.allclose(original.images, same_grid.images, atol=1e-5), "one view under one scale has nothing to scramble"
+
+
+def test_raymaps_of_photos_have_an_entry_of_their_own(model):
+    raymaps = model.recover_raymaps(torch.rand(3, 3, 32, 32, generator=seeded(2)), generator=seeded(), sampling=QUICK)
+    assert raymaps.shape == (3, 6, 32, 32) and torch.allclose(raymaps[:, 3:].norm(dim=1), torch.ones(3, 32, 32), atol=1e-4)

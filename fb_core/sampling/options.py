@@ -34,8 +34,8 @@ class SamplingConfig:
     'corrected' (AB2 with a bounded correction, for few steps)."""
     grid: str = "even"
     """'even', or the original's 'reference', whose last step is worth nothing."""
-    shift: float = 1.0
-    """Time shift of the grid; above 1 spends more steps near the noise."""
+    shift: float = 2.0
+    """Time shift of the grid; above 1 spends more steps near the noise (docs/speed_and_accuracy.md has what 2 is worth)."""
     strength: float = 1.0
     """Time at which sampling starts from the `current` views that are given; 1 is pure noise, and they do not matter."""
     known: str = "guided"

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-VelocityField = Callable[[Float[Tensor, "n 32 h w"], float], Float[Tensor, "n 32 h w"]]
+VelocityField = Callable[[Float[Tensor, "n *rest"], float], Float[Tensor, "n *rest"]]
 """dz/dt at a state and a time."""
 
 
@@ -80,6 +80,7 @@ def ab2(field: VelocityField, point: Point, following: float) -> Point:
     return Point(state=state, time=following, last=Slope(time=point.time, velocity=slope))
 
 
+_SHORTEST = 1e-20
 EXTRAPOLATION_LIMIT, CORRECTION_LIMIT = 0.5, 0.25
 """Most that the second-order term and the correction may move a view, as shares of what Euler's step moves it."""
 
@@ -125,7 +126,5 @@ def _length(values: Tensor) -> Tensor:
 
 
 def _limited(values: Tensor, most: Tensor) -> Tensor:
-    """The values, shortened per view where they are longer than `most`."""
-    length = _length(values)
-    share = most / length.clamp(min=torch.finfo(length.dtype).tiny)
-    return torch.where(length > most, values * share, values)
+    """The values, shortened per view where they are longer than `most`; the factor is at most 1, in its gradient too."""
+    return values * (most / torch.maximum(_length(values), most).clamp(min=_SHORTEST))

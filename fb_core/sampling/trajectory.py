@@ -47,14 +47,14 @@ class SamplingInterrupted(KeyboardInterrupt):
 
 def integrate(
     field: VelocityField,
-    state: Float[Tensor, "n 32 h w"],
+    state: Float[Tensor, "n *rest"],
     times: Sequence[float],
     *,
     solver: str = "euler",
     on_step: OnStep | None = None,
     on_trajectory: OnTrajectory | None = None,
     resume: Trajectory | None = None,
-) -> Float[Tensor, "n 32 h w"]:
+) -> Float[Tensor, "n *rest"]:
     """Follow dz/dt = field(z, t) along ``times`` (descending), in float32 at least.
 
     Args:

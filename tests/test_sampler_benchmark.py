@@ -1,0 +1,46 @@
+"""``fillerbuster bench sampler`` in miniature: its form, its counts of passes, its figure."""
+
+import dataclasses
+import json
+
+import pytest
+from tiny_models import save_tiny_model
+
+from fb_core.evaluation import benchmark_sampler
+from fb_core.evaluation.benchmark_sampler import QUICK, SamplerBenchmark, run_sampler
+from fb_core.sampler import SOLVERS
+from method_configs import commands
+
+
+def test_the_command_writes_its_report_and_figure(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark_sampler, "QUICK", dataclasses.replace(QUICK, steps=(2,), fine_steps=4, reference_steps=2))
+    model = save_tiny_model(tmp_path / "model")
+    files = ["--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")]
+    commands.main(["bench", "sampler", "--quick", "--model", str(model), *files])
+    content = json.loads((tmp_path / "s.json").read_text())
+    parts = {row["part"] for row in content["rows"]}
+    assert {"solvable flow", "trained model", "raymaps of views beside one that is posed"} < parts
+    assert sum("another distribution" in part for part in parts) == 2
+    for flow in ("solvable flow", "trained model"):
+        rows = [row for row in content["rows"] if row["part"] == flow]
+        assert rows[0]["solver"].startswith("original") and rows[0]["passes"] == 6
+        assert {row["solver"] for row in rows[1:]} == set(SOLVERS) - {"heun"}, "Heun takes half of the steps, and half of 2 is too few"
+        assert {row["grid"] for row in rows} == {"shift 2", "reference"}
+        assert all(row["passes"] == 4 and row["error"] > 0 for row in rows[1:])
+    assert all(bar["limit"] == 32 and "passes of" in bar["name"] for bar in content["bars"])
+    assert (tmp_path / "s.png").stat().st_size > 1000
+
+
+def test_on_the_solvable_flow_the_default_holds_its_bar_and_intervals_lead_elsewhere():
+    config = dataclasses.replace(SamplerBenchmark(), guidance=(3.0,), steps=(16,), shifts=(2.0,), problems=1, fine_steps=100, model=False)
+    report = run_sampler(config)
+    assert len(report.bars) == 2 and all(bar.holds for bar in report.bars)
+    limited = [row for row in report.rows if "interval" in row]
+    assert len(limited) == 2 and all(row["passes"] < row["passes_of_all"] for row in limited)
+    assert all(row["distance_of_that_end"] > row["error_to_its_own_end"] for row in limited)
+
+
+@pytest.mark.parametrize("nonsense", [{"views": 1}, {"steps": (0,)}, {"guidance": ()}, {"problems": 0}])
+def test_nonsense_is_refused(nonsense):
+    with pytest.raises(ValueError, match="at least one problem"):
+        SamplerBenchmark(**nonsense)
