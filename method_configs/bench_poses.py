@@ -70,7 +70,7 @@ def draw(report: Report, path: Path) -> None:
             axes.errorbar(where, medians, yerr=[[0.0] * len(above), above], fmt="o", capsize=3, label=f"{label}, {seconds:.2g} s of CPU")
     axes.set_yscale("log")
     axes.set_ylabel("rotation error in degrees, median to worst view")
-    axes.set_xticks(list(places), [row["case"].replace(", ", ",\n") for row in rows], fontsize=8)
+    axes.set_xticks(list(places), [row["case"].replace(", ", ",\n").replace("% ", "%\n") for row in rows], fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)

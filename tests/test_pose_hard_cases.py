@@ -217,7 +217,10 @@ def test_tiny_and_huge_directions_and_half_precision() -> None:
     raymaps = raymaps_of(cameras).float()
     for factor in (1e-30, 1e30):
         scaled = torch.cat([raymaps[:, :3], raymaps[:, 3:] * factor], dim=1)
-        assert rotation_degrees(recover_cameras(scaled).cameras, cameras).max() < 1e-4
+        scaled[:, 3:, :3, :5] = scaled[:, 3:, :3, :5].flip(1)
+        found = recover_cameras(scaled)
+        assert rotation_degrees(found.cameras, cameras).max() < 1e-4
+        assert not found.inliers[:, :3, :5].all() and found.inliers[:, 3:].all() and found.inliers[:, :, 5:].all()
     for dtype, degrees in ((torch.bfloat16, 0.2), (torch.float16, 0.02)):
         found = recover_cameras(raymaps.to(dtype))
         assert found.cameras.focal.dtype == torch.float32 and found.inliers.all() and all_finite(found)

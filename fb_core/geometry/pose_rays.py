@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +34,11 @@ class Rays:
     def usable(self) -> Bool[Tensor, "n r"]:
         """Rays that take part."""
         return self.weights > 0
+
+    def leading(self, count: int) -> Rays:
+        """At most so many rays of each view."""
+        part = {name: getattr(self, name)[..., :count] for name in ("origins", "directions", "pixels", "weights")}
+        return dataclasses.replace(self, **part)
 
 
 def length_of(vectors: Float[Tensor, "n c *r"]) -> Float[Tensor, "n *r"]:

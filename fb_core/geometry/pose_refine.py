@@ -19,9 +19,10 @@ from fb_core.geometry.pose_rays import Rays, length_of
 from fb_core.geometry.pose_seed import MEDIAN_OF_NORM_2D
 
 _KEPT = 4.0  # beyond so many deviations a direction is an outlier (one in 3000 true ones is)
-_ROUNDS = 4  # of choosing the inliers anew; the first round weighs softly
+_HARD_ROUNDS = 3  # of choosing the inliers anew
 _STEPS = 6  # at most, between two choices
-_SOFT_STEPS = 2  # before the first hard one, which needs no optimum
+_SOFT_STEPS = 2  # before the first choice
+_SOFT_RAYS = 1024  # for these
 _CONVERGED = 1e-11  # radians, and relative for focal lengths
 _RIDGE = 1e-14  # of the mean diagonal: keeps undetermined parameters where they are
 
@@ -74,8 +75,8 @@ class Refined:
     """Of rotation (radians, camera frame), fx, fy, cx, cy (pixels), if directions err independently; zero for what is given."""
 
 
-def refine(fit: Fit, rays: Rays, model: Model, *, deviation: Float[Tensor, " n"]) -> Refined:
-    """Inliers and cameras in turn from a guess with robust deviation ``deviation`` of its directions.
+def refine(fit: Fit, rays: Rays, model: Model) -> Refined:
+    """Inliers and cameras in turn from a guess.
 
     Differentiable in the inlying rays: one last Gauss-Newton step, at the optimum, has the optimum's own derivative (up to
     the curvature of the residuals, which vanishes with them).
@@ -83,30 +84,32 @@ def refine(fit: Fit, rays: Rays, model: Model, *, deviation: Float[Tensor, " n"]
     fixed = dataclasses.replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
     if model.shared_focal or model.square_pixels:
         fit = dataclasses.replace(fit, focal=_tied(fit.focal, rays.weights.sum(dim=1), model))
-    kept = fixed.weights
-    for round_ in range(_ROUNDS):
+    fit, hessian = _softly(fit, fixed.leading(_SOFT_RAYS), model)
+    kept, used = fixed.weights, fixed.weights.new_ones(len(fixed.weights))
+    for round_ in range(_HARD_ROUNDS):
         misses = _misses(fit, fixed)
-        if round_ < 2:
-            deviation = median_over(misses, fixed.usable) / MEDIAN_OF_NORM_2D
-        else:
-            deviation = _deviation(misses, kept, model)
+        deviation = _deviation(misses, kept, model) if round_ else median_over(misses, fixed.usable) / MEDIAN_OF_NORM_2D
         deviation = deviation.clamp_min(rays.precision)
-        relative = misses / deviation[:, None]
-        before = kept
-        kept = fixed.weights / (1 + (relative / 2.5).square()).square()
-        if round_ > 0:
-            kept = torch.where(relative <= _KEPT, fixed.weights, 0.0)
-        if round_ > 1 and not model.shared_focal and torch.equal(kept, before):
+        before, kept = kept, torch.where(misses <= _KEPT * deviation[:, None], fixed.weights, 0.0)
+        if round_ and not model.shared_focal and torch.equal(kept, before):
             break  # the same inliers have the same optimum
-        fit, hessian = _descend(fit, fixed, kept / deviation.square()[:, None], model, steps=_STEPS if round_ else _SOFT_STEPS)
-        scale = deviation.square()
+        fit, hessian = _descend(fit, fixed, kept / deviation.square()[:, None], model, steps=_STEPS)
+        used = deviation
     deviation = _deviation(_misses(fit, fixed), kept, model).clamp_min(rays.precision)
-    hessian = hessian * (scale / deviation.square())[:, None, None]
+    hessian = hessian * (used / deviation).square()[:, None, None]
     covariance = _covariance(fit, hessian, model)
     if rays.directions.requires_grad:
         _, gradient, _ = _normal_equations(fit, rays, kept / deviation.square()[:, None], model)
         fit = _moved(fit, _step(hessian, gradient, torch.zeros_like(deviation), model), model)
     return Refined(fit=fit, deviation=deviation, limit=_KEPT * deviation, covariance=covariance)
+
+
+def _softly(fit: Fit, rays: Rays, model: Model) -> tuple[Fit, Float[Tensor, "n p p"]]:
+    """A few steps with Geman-McClure weights, which takes the algebraic bias out of the closed form."""
+    misses = _misses(fit, rays)
+    deviation = (median_over(misses, rays.usable) / MEDIAN_OF_NORM_2D).clamp_min(rays.precision)[:, None]
+    soft = rays.weights / (1 + (misses / (2.5 * deviation)).square()).square()
+    return _descend(fit, rays, soft / deviation.square(), model, steps=_SOFT_STEPS)
 
 
 def rotation_of(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:

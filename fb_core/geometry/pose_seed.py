@@ -6,7 +6,6 @@ give it as the eigenvector of a 9x9 matrix (direct linear transform). M then fal
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +43,7 @@ def seeds_of(rays: Rays, *, hypotheses: int, seed: int) -> Seeds:
 
     A view's draws depend on the seed alone, not on the other views. The leading rays of each list are enough for a seed.
     """
-    rays = _leading(rays, _SEEDING_RAYS)
+    rays = rays.leading(_SEEDING_RAYS)
     plane, normalizer = _normalized(rays.pixels, rays.usable)
     candidates = torch.cat([_linear(plane, rays.directions, rays.weights)[:, None], _minimal(plane, rays, hypotheses, seed)], dim=1)
     homography = _consensus(candidates, plane, rays)
@@ -58,11 +57,6 @@ def seeds_of(rays: Rays, *, hypotheses: int, seed: int) -> Seeds:
     mean = torch.einsum("nr,nir->ni", share, mapped)
     spread = (share * (mapped - mean[..., None]).square().sum(dim=1)).sum(dim=1).sqrt()
     return Seeds(homography=homography @ normalizer, deviation=deviation, spread=spread, mirrored=torch.linalg.det(homography) < 0)
-
-
-def _leading(rays: Rays, count: int) -> Rays:
-    part = {name: getattr(rays, name)[..., :count] for name in ("origins", "directions", "pixels", "weights")}
-    return dataclasses.replace(rays, **part)
 
 
 def camera_of(

@@ -17,12 +17,11 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.pose_centers import Centers, robust_centers
+from fb_core.geometry.pose_inliers import Limits, agreeing_rays, homography_of
 from fb_core.geometry.pose_rays import Rays, rays_of, rays_of_raymaps, sound_rays
 from fb_core.geometry.pose_refine import Fit, Model, Refined, refine
 from fb_core.geometry.pose_seed import camera_of, seeds_of
 from fb_core.geometry.pose_verdict import Arrangement, Judgement, Verdict, arrangement_of, judge_seeds, judge_share
-
-_RAYS_AT_ONCE = 2**16  # so many stay in a processor's cache
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +116,10 @@ def recover_cameras(
     sound = sound_rays(raymaps.detach())
     rays = rays_of_raymaps(raymaps, weights[:, 0], sound, at_most=solving.rays_per_view)
     found = _recover(rays, principal, width, height, solving, dtype=_working(raymaps.dtype))
-    with torch.no_grad():
-        pixels = found.cameras.pixel_centers().permute(2, 0, 1)[None]
-        agreeing = _agreeing(found, raymaps.detach().to(pixels.dtype), pixels, weights[:, 0])
+    like = raymaps.detach().to(found.cameras.focal.dtype)
+    x = torch.arange(width, device=like.device, dtype=like.dtype)[None, None] + 0.5
+    y = torch.arange(height, device=like.device, dtype=like.dtype)[None, :, None] + 0.5
+    agreeing = agreeing_rays(like, x, y, weights[:, 0], _limits(found))
     return _concluded(found, agreeing, (weights[:, 0] > 0) & sound, solving)
 
 
@@ -147,8 +147,8 @@ def recover_cameras_from_rays(
     points = pixels.transpose(1, 2)
     found = _recover(rays_of(rays, points, weights), principal, width, height, solving, dtype=_working(origins.dtype))
     sound = sound_rays(rays.detach())
-    with torch.no_grad():
-        agreeing = _agreeing(found, rays.detach().to(found.cameras.focal.dtype), points.to(found.cameras.focal.dtype), weights)
+    like, points = rays.detach().to(found.cameras.focal.dtype), points.to(found.cameras.focal.dtype)
+    agreeing = agreeing_rays(like, points[:, 0], points[:, 1], weights, _limits(found))
     return _concluded(found, agreeing, (weights > 0) & sound, solving)
 
 
@@ -188,7 +188,6 @@ def _recover(
         Fit(rotations=rotations, focal=focal, principal=center),
         dataclasses.replace(rays, weights=weights),
         model,
-        deviation=seeds.deviation,
     )
     fit = refined.fit
     pose = torch.cat([fit.rotations, centers.position[..., None]], dim=2)
@@ -196,45 +195,18 @@ def _recover(
     return _Found(cameras=cameras, refined=refined, centers=centers, judgements=judgements, rays=rays)
 
 
-def _agreeing(
-    found: _Found, rays: Float[Tensor, "n 6 *r"], pixels: Float[Tensor, "#n 2 *r"], weights: Float[Tensor, "n *r"]
-) -> Bool[Tensor, "n *r"]:
-    """Which rays start near their camera's centre and run along its own; NaN agrees with nothing.
-
-    In the precision of the cameras, for whose rounding the limits allow. A few views at a time, which stay in the processor's cache.
-    """
-    precision = max(found.rays.precision, torch.finfo(rays.dtype).eps)
-    turn = found.refined.limit.clamp(8 * precision, 1.0).to(rays.dtype)
-    shift = torch.maximum(found.centers.limit, 8 * precision * found.centers.position.norm(dim=1)).to(rays.dtype)
-    agreeing = torch.empty(weights.shape, dtype=torch.bool, device=weights.device)
-    at_once = max(1, _RAYS_AT_ONCE // max(1, weights[:1].numel()))
-    for first in range(0, len(rays), at_once):
-        part = slice(first, first + at_once)
-        seen = pixels if len(pixels) == 1 else pixels[part]
-        agreeing[part] = _agreeing_part(found.cameras[part], rays[part], seen, weights[part], turn[part], shift[part])
-    return agreeing
-
-
-def _agreeing_part(
-    cameras: Pinholes,
-    rays: Float[Tensor, "n 6 *r"],
-    pixels: Float[Tensor, "#n 2 *r"],
-    weights: Float[Tensor, "n *r"],
-    turn: Float[Tensor, " n"],
-    shift: Float[Tensor, " n"],
-) -> Bool[Tensor, "n *r"]:
-    """The same for some views, given the largest angle and distance. Sines come from cross products, exact for small angles."""
-
-    def wide(values: Tensor) -> Tensor:
-        return values.reshape(*values.shape, *[1] * (weights.dim() - 1))
-
-    near = (rays[:, :3] - wide(cameras.centers)).square().sum(dim=1) * weights <= wide(shift.square())
-    k = (pixels - wide(cameras.principal)) / wide(cameras.focal)
-    d = (cameras.rotations.transpose(1, 2) @ rays[:, 3:].flatten(2)).unflatten(2, rays.shape[2:])
-    (kx, ky), (x, y, z) = k.unbind(dim=1), d.unbind(dim=1)
-    sines = (y - ky * z).square() + (kx * z - x).square() + (x * ky - y * kx).square()
-    lengths = (1 + k.square().sum(dim=1)) * d.square().sum(dim=1)
-    return near & (kx * x + ky * y + z > 0) & (sines * weights <= wide(turn.square()) * lengths)
+@torch.no_grad()
+def _limits(found: _Found) -> Limits:
+    """What inliers are measured by, in the precision of the result, for whose rounding the limits allow."""
+    fit, dtype = found.refined.fit, found.cameras.focal.dtype
+    rounding = 8 * max(found.rays.precision, torch.finfo(dtype).eps)
+    position = found.centers.position
+    return Limits(
+        homography=homography_of(fit.rotations, fit.focal, fit.principal).to(dtype),
+        centers=position.to(dtype),
+        turn=found.refined.limit.clamp(rounding, 1.0).to(dtype),
+        shift=torch.maximum(found.centers.limit, rounding * position.norm(dim=1)).to(dtype),
+    )
 
 
 @torch.no_grad()
