@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from nerfstudio.engine.optimizers import Optimizers
 
     from fb_core.data.room_captures import RoomCapture
-    from fb_core.evaluation.benchmarks import OnCell, Report
+    from fb_core.evaluation.benchmarks import Bar, OnCell, Report
     from fb_core.geometry.cameras import Pinholes
     from fb_nerfstudio.splat_model import FillerbusterSplatModel
 
@@ -27,7 +27,7 @@ STRATEGIES = ("default", "mcmc", "mcmc as published")
 _RARE_EVERY = 50
 _RARE_VIEWS = 2
 _EVALUATED = 6
-_MELTED_DB = 1.0
+_MELTED_DB, _KEPT_DB = 1.0, 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class Fit:
 def run_fit(config: Fit, *, on_cell: OnCell = lambda _: None) -> Report:
     """Rows "curve" (one per strategy and measurement) and "end" (one per strategy); bars on the cap, and on what melts."""
     from fb_core.data.room_captures import casual_capture
-    from fb_core.evaluation.benchmarks import Bar, Report
+    from fb_core.evaluation.benchmarks import Report
 
     capture = _to_unit_size(casual_capture(config.seed, size=config.size, held_out=2 * _RARE_VIEWS))
     report = Report(seed=config.seed)
@@ -89,14 +89,24 @@ def run_fit(config: Fit, *, on_cell: OnCell = lambda _: None) -> Report:
             "most_gaussians": max(row["gaussians"] for row in curve), "seconds": last["seconds"],
         })  # fmt: skip
     report.rows.extend(ends)
-    for end in ends:
-        report.bars.append(
-            Bar(name=f"most Gaussians, {end['strategy']}", value=end["most_gaussians"], limit=config.max_gaussians, sense="<=")
-        )
-        if end["strategy"] in ("default", "mcmc"):
-            name = f"dB lost by rarely seen views since their best, {end['strategy']}"
-            report.bars.append(Bar(name=name, value=end["rare_lost_db"], limit=_MELTED_DB, sense="<="))
+    report.bars.extend(_bars(ends, config.max_gaussians))
     return report
+
+
+def _bars(ends: list[dict[str, Any]], cap: int) -> list[Bar]:
+    """No growth past the cap; rarely seen views lose nothing worth mentioning, and far less than by the published rule."""
+    from fb_core.evaluation.benchmarks import Bar
+
+    bars = [Bar(name=f"most Gaussians, {end['strategy']}", value=end["most_gaussians"], limit=cap, sense="<=") for end in ends]
+    rare = {end["strategy"]: end for end in ends}
+    for strategy in ("default", "mcmc"):
+        if strategy in rare:
+            name = f"dB lost by rarely seen views since their best, {strategy}"
+            bars.append(Bar(name=name, value=rare[strategy]["rare_lost_db"], limit=_MELTED_DB, sense="<="))
+    if {"mcmc", "mcmc as published"} <= set(rare):
+        gained = rare["mcmc"]["rare_psnr"] - rare["mcmc as published"]["rare_psnr"]
+        bars.append(Bar(name="dB of rarely seen views above mcmc as published", value=gained, limit=_KEPT_DB, sense=">="))
+    return bars
 
 
 def _to_unit_size(capture: RoomCapture) -> RoomCapture:
