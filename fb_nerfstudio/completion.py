@@ -12,13 +12,14 @@ from typing import Protocol
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import ANCHOR, CompletedViews, Origin
+from fb_nerfstudio.completion_cache import CompletionCache, round_key
 from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, PlannedRound, plan_completion
 
@@ -48,7 +49,13 @@ class Inpainter(Protocol):
     def recommended_sampling(self) -> SamplingConfig: ...
 
     def complete(
-        self, views: Views, *, generator: torch.Generator, sampling: SamplingConfig, on_step: Callable[[int, int], None] | None
+        self,
+        views: Views,
+        *,
+        generator: torch.Generator,
+        sampling: SamplingConfig,
+        on_step: Callable[[int, int], None] | None,
+        prompt: str | None = None,
     ) -> Views: ...
 
 
@@ -72,11 +79,13 @@ def run_completion(
     *,
     done: CompletedViews | None = None,
     on_step: Callable[[PlannedRound, int, int], None] | None = None,
+    on_found: Callable[[PlannedRound], None] | None = None,
 ) -> Iterator[CompletedViews]:
     """Generate the planned rounds one after the other; yields the new views of each.
 
     Every round sees the context views (fitted to the model's size) and, if it is no anchor round, all anchors. The same plan,
-    context, model and options give the same views whatever happened before: each round has its own seed.
+    context, model and options give the same views whatever happened before: each round has its own seed. With ``config.cache_dir``
+    a round that was ever generated from the same inputs is loaded instead.
 
     Args:
         plan: what to generate.
@@ -85,33 +94,67 @@ def run_completion(
         config: sampling options.
         done: views of rounds that an interrupted run has generated; these rounds are skipped.
         on_step: called with (round, denoising steps done, steps in all).
+        on_found: called with a round that is loaded from the cache.
+
+    Raises ValueError when the cache's folder is a file, and as the model does.
     """
+    cache = open_cache(config)
     fitted = Views.cat([fitted_view(view, plan.size) for view in context])
     finished = [] if done is None else done.rounds
     anchors = None if done is None else _as_views(done[[i for i, origin in enumerate(done.origins) if origin.role == ANCHOR]])
     for planned in plan.rounds:
         if planned.number in finished:
             continue
-        known = [fitted] if planned.role == ANCHOR or anchors is None else [fitted, anchors]
+        captured = fitted[list(plan.context_of(planned))]
+        known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
-        filled = model.complete(
-            sequence,
-            generator=torch.Generator().manual_seed(planned.seed),
-            sampling=config.sampling(model.recommended_sampling),
-            on_step=None if on_step is None else lambda step, steps, planned=planned: on_step(planned, step, steps),
-        )
-        new = filled[list(range(len(sequence) - len(planned.cameras), len(sequence)))]
-        images = (new.images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
-        origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt="", model_hash=model.model_hash)
+        images = round_images(sequence, planned, model, config, cache, on_step, on_found)
+        origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash)
         views = CompletedViews(
             images=images,
-            masks=torch.ones_like(images[..., :1], dtype=torch.bool),
+            masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),
             cameras=planned.cameras,
             origins=(origin,) * len(planned.cameras),
         )
         if planned.role == ANCHOR:
             anchors = _as_views(views)
         yield views
+
+
+def open_cache(config: CompletionConfig) -> CompletionCache | None:
+    """The cache that is asked for. Raises ValueError when its folder is a file."""
+    return None if config.cache_dir is None else CompletionCache(config.cache_dir)
+
+
+def round_images(
+    sequence: Views,
+    planned: PlannedRound,
+    model: Inpainter,
+    config: CompletionConfig,
+    cache: CompletionCache | None,
+    on_step: Callable[[PlannedRound, int, int], None] | None,
+    on_found: Callable[[PlannedRound], None] | None,
+) -> UInt8[Tensor, "n h w 3"]:
+    """Pictures of the sequence's last views, those of the round: from the cache, or generated and kept there."""
+    sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
+    key = "" if cache is None else round_key(sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt)
+    found = None if cache is None else cache.find(key, views=views, size=sequence.size[0])
+    if found is not None:
+        if on_found is not None:
+            on_found(planned)
+        return found
+    filled = model.complete(
+        sequence,
+        generator=torch.Generator().manual_seed(planned.seed),
+        sampling=sampling,
+        on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
+        **({"prompt": prompt} if prompt else {}),
+    )
+    new = filled[list(range(len(sequence) - views, len(sequence)))]
+    images = (new.images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
+    if cache is not None:
+        cache.keep(key, images)
+    return images
 
 
 def fitted_view(view: CapturedView, size: int) -> Views:
@@ -121,8 +164,7 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     matter; a resampled pixel is known when all that it was made from is known.
     """
     _, height, width = view.image.shape
-    scale = size / max(height, width)
-    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
+    left, top, new_width, new_height = fitted_rectangle(height, width, size)
     known = view.known.to(view.image)
     content = torch.cat([torch.where(known > 0, view.image, torch.zeros_like(view.image)) * known, known])
     if (new_height, new_width) != (height, width):
@@ -130,23 +172,42 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     share = content[3:]
     known = (share > 0.999).to(content)
     image = torch.where(known > 0, content[:3] / share.clamp(min=1e-6), torch.zeros_like(content[:3]))
-    left, top = (size - new_width) // 2, (size - new_height) // 2
     pads = (left, size - new_width - left, top, size - new_height - top)
     camera = view.camera.scaled(new_width, new_height).cropped(-left, -top, size, size)
     return Views.known(F.pad(image, pads)[None], camera, mask=F.pad(known, pads)[None])
 
 
+def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, int, int]:
+    """Where in a square a picture stands whose long side is scaled to the square's: left, top, width, height in pixels."""
+    scale = size / max(height, width)
+    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
+    return (size - new_width) // 2, (size - new_height) // 2, new_width, new_height
+
+
 def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None) -> str:
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left."""
-    name = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
     asked = "" if len(plan.context) >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
     there = "" if done is None else f"; {len(done)} of these views are there already"
     sequence = len(plan.context) + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
     return (
-        f"Completing the scene with {name} ({model.model_hash[:8]}): {plan.new_views} new views of {plan.size}x{plan.size} pixels "
+        f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): {plan.new_views} new views of {plan.size}x{plan.size} pixels "
         f"in {len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views, "
         f"conditioned on {len(plan.context)} of {plan.captured} captured views{asked}{there}."
     )
+
+
+def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:
+    """True in the largest rectangle of an aspect (width over height) in the middle of a square."""
+    left, top, width, height = fitted_rectangle(*((1.0, aspect) if aspect > 1 else (1 / aspect, 1.0)), size)
+    mask = torch.zeros(1, size, size, 1, dtype=torch.bool)
+    mask[:, top : top + height, left : left + width] = True
+    return mask
+
+
+def model_name(config: CompletionConfig, model: Inpainter) -> str:
+    """What a person calls the model."""
+    own = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
+    return getattr(model, "name", own)
 
 
 def _anchors(plan: CompletionPlan) -> int:

@@ -23,13 +23,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
-from fb_core.inpainter import Fillerbuster
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
 from fb_nerfstudio.dataparser import without_open3d
+from fb_nerfstudio.lazy_inpainter import LazyInpainter
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
 from fb_nerfstudio.start_points import start_points
 from fb_nerfstudio.unseen import (
@@ -201,7 +201,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             context = [self._captured_view(index, cameras[index]) for index in plan.context]
             left = len(plan.rounds) - (0 if self._bank is None else len(self._bank.rounds))
             with _Bars(self.completion_panel, len(plan.rounds)) as bars, _refusing():
-                for views in run_completion(plan, context, model, config, done=self._bank, on_step=bars.step):
+                for views in run_completion(plan, context, model, config, done=self._bank, on_step=bars.step, on_found=_say_found):
                     left -= 1
                     self._set_bank(views if self._bank is None else CompletedViews.cat([self._bank, views]))
                     if left > 0:
@@ -227,9 +227,9 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         refuse_bad_model(self.config.completion)
 
     def _load_inpainter(self) -> Inpainter:
-        """The diffusion model, on the training device. Raises Refused with one sentence when its weights are broken."""
+        """The diffusion model for the training device. Raises Refused with one sentence when its folder is broken."""
         try:
-            return Fillerbuster.from_pretrained(self.config.completion.model, device=self.device)
+            return LazyInpainter(self.config.completion.model, self.device)
         except ValueError as error:
             raise Refused(str(error)) from None
 
@@ -289,6 +289,11 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._finished = bool(state["finished"])
         self._captured_draws = int(state["captured_draws"])
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
+
+
+def _say_found(planned: PlannedRound) -> None:
+    title = "Anchors" if planned.role == "anchor" else f"Round {planned.number}"
+    CONSOLE.print(f"{title}: {len(planned.cameras)} views found in the cache, nothing is generated for them.")
 
 
 @contextmanager

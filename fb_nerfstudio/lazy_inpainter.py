@@ -1,0 +1,53 @@
+"""The diffusion model, loaded when it is first asked to complete something: rounds from the cache need only its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from fb_core import checkpoint
+from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster, SamplingConfig
+from fb_core.views import Views
+
+
+class LazyInpainter:
+    """What a completion needs of ``Fillerbuster``. Size, options and hash come from the folder, weights only when they must work."""
+
+    def __init__(self, folder: Path | None, device: torch.device | str):
+        """``folder`` None is the bundled model. Raises ValueError for a folder that is no model."""
+        self._folder, self._device = folder, device
+        self._model: Fillerbuster | None = None
+        path = BUNDLED_MODEL if folder is None else folder
+        self._info = checkpoint.read_config(path)[1]
+        self.model_hash = checkpoint.model_hash(path)
+
+    @property
+    def size(self) -> int:
+        """Image side in pixels that the model was trained at."""
+        return int(self._info.get("image_size", 256))
+
+    @property
+    def recommended_sampling(self) -> SamplingConfig:
+        """How the model samples best."""
+        return SamplingConfig.from_dict(self._info.get("sampling", {}))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the weights have been needed so far."""
+        return self._model is not None
+
+    def complete(
+        self,
+        views: Views,
+        *,
+        generator: torch.Generator,
+        sampling: SamplingConfig,
+        on_step: Callable[[int, int], None] | None,
+        prompt: str | None = None,
+    ) -> Views:
+        """``Fillerbuster.complete``; the first call loads the weights. Raises ValueError when they are broken."""
+        if self._model is None:
+            self._model = Fillerbuster.from_pretrained(self._folder, device=self._device)
+        return self._model.complete(views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt)
