@@ -12,7 +12,7 @@ from typing import Protocol
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -49,7 +49,13 @@ class Inpainter(Protocol):
     def recommended_sampling(self) -> SamplingConfig: ...
 
     def complete(
-        self, views: Views, *, generator: torch.Generator, sampling: SamplingConfig, on_step: Callable[[int, int], None] | None
+        self,
+        views: Views,
+        *,
+        generator: torch.Generator,
+        sampling: SamplingConfig,
+        on_step: Callable[[int, int], None] | None,
+        prompt: str | None = None,
     ) -> Views: ...
 
 
@@ -99,13 +105,14 @@ def run_completion(
     for planned in plan.rounds:
         if planned.number in finished:
             continue
-        known = [fitted] if planned.role == ANCHOR or anchors is None else [fitted, anchors]
+        captured = fitted[list(plan.context_of(planned))]
+        known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
         images = round_images(sequence, planned, model, config, cache, on_step, on_found)
-        origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt="", model_hash=model.model_hash)
+        origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash)
         views = CompletedViews(
             images=images,
-            masks=torch.ones_like(images[..., :1], dtype=torch.bool),
+            masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),
             cameras=planned.cameras,
             origins=(origin,) * len(planned.cameras),
         )
@@ -129,8 +136,8 @@ def round_images(
     on_found: Callable[[PlannedRound], None] | None,
 ) -> UInt8[Tensor, "n h w 3"]:
     """Pictures of the sequence's last views, those of the round: from the cache, or generated and kept there."""
-    sampling, views = config.sampling(model.recommended_sampling), len(planned.cameras)
-    key = "" if cache is None else round_key(sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash)
+    sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
+    key = "" if cache is None else round_key(sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt)
     found = None if cache is None else cache.find(key, views=views, size=sequence.size[0])
     if found is not None:
         if on_found is not None:
@@ -141,6 +148,7 @@ def round_images(
         generator=torch.Generator().manual_seed(planned.seed),
         sampling=sampling,
         on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
+        **({"prompt": prompt} if prompt else {}),
     )
     new = filled[list(range(len(sequence) - views, len(sequence)))]
     images = (new.images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
@@ -156,8 +164,7 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     matter; a resampled pixel is known when all that it was made from is known.
     """
     _, height, width = view.image.shape
-    scale = size / max(height, width)
-    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
+    left, top, new_width, new_height = fitted_rectangle(height, width, size)
     known = view.known.to(view.image)
     content = torch.cat([torch.where(known > 0, view.image, torch.zeros_like(view.image)) * known, known])
     if (new_height, new_width) != (height, width):
@@ -165,23 +172,44 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     share = content[3:]
     known = (share > 0.999).to(content)
     image = torch.where(known > 0, content[:3] / share.clamp(min=1e-6), torch.zeros_like(content[:3]))
-    left, top = (size - new_width) // 2, (size - new_height) // 2
     pads = (left, size - new_width - left, top, size - new_height - top)
     camera = view.camera.scaled(new_width, new_height).cropped(-left, -top, size, size)
     return Views.known(F.pad(image, pads)[None], camera, mask=F.pad(known, pads)[None])
 
 
+def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, int, int]:
+    """Where in a square a picture stands whose long side is scaled to the square's: left, top, width, height in pixels."""
+    scale = size / max(height, width)
+    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
+    return (size - new_width) // 2, (size - new_height) // 2, new_width, new_height
+
+
 def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None) -> str:
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left."""
-    name = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
-    asked = "" if len(plan.context) >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
+    context = max(len(plan.context_of(one)) for one in plan.rounds)
+    asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
     there = "" if done is None else f"; {len(done)} of these views are there already"
-    sequence = len(plan.context) + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
+    along = "" if config.camera_path is None else f" along {config.camera_path.name}"
+    sequence = context + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
     return (
-        f"Completing the scene with {name} ({model.model_hash[:8]}): {plan.new_views} new views of {plan.size}x{plan.size} pixels "
-        f"in {len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views, "
-        f"conditioned on {len(plan.context)} of {plan.captured} captured views{asked}{there}."
+        f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
+        f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views, "
+        f"conditioned on {context} of {plan.captured} captured views{asked}{there}."
     )
+
+
+def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:
+    """True in the largest rectangle of an aspect (width over height) in the middle of a square."""
+    left, top, width, height = fitted_rectangle(*((1.0, aspect) if aspect > 1 else (1 / aspect, 1.0)), size)
+    mask = torch.zeros(1, size, size, 1, dtype=torch.bool)
+    mask[:, top : top + height, left : left + width] = True
+    return mask
+
+
+def model_name(config: CompletionConfig, model: Inpainter) -> str:
+    """What a person calls the model."""
+    own = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
+    return getattr(model, "name", own)
 
 
 def _anchors(plan: CompletionPlan) -> int:

@@ -29,25 +29,56 @@ class PlacementConfig:
 
 
 @dataclass
+class MaskedConfig:
+    """Inpainting the unknown parts of captured pictures (``task`` inpaint)."""
+
+    views: int = 32
+    """Captured pictures, equally spaced, that are inpainted together; all when the capture has fewer."""
+    dilate: int = 5
+    """Pixels of the capture by which holes grow before they are inpainted; masks are seldom exact. The rim keeps its captured colours."""
+
+    def __post_init__(self) -> None:
+        if self.views < 1:
+            raise ValueError(f"completion.masked.views: expected at least 1, got {self.views}")
+        if self.dilate < 0:
+            raise ValueError(f"completion.masked.dilate: expected 0 or more pixels, got {self.dilate}")
+
+
+@dataclass
 class CompletionConfig:
     """What is generated, with which model, and how it takes part in the training."""
 
     enabled: bool = True
     """Complete the capture with generated views; without, this is plain Gaussian splatting."""
+    task: Literal["new-views", "inpaint"] = "new-views"
+    """Generate views from new cameras, or fill the unknown parts of captured pictures (masks, alpha) and place no camera."""
     model: Path | None = None
     """Folder of the diffusion model (config.json and safetensors); None is the small bundled model."""
+    inpainter: Literal["diffusion", "grid"] = "diffusion"
+    """What fills pixels: the multi-view diffusion model, or a 2D inpainter on 2x2 grids of views (the NeRFiller baseline)."""
+    inpainter_weights: Path | None = None
+    """Folder of a diffusers inpainting pipeline for the grids; None is OpenCV's inpainting, which has no weights."""
+    prompt: str = ""
+    """What is to be seen, for models that read text."""
+    text_encoder: Path | None = None
+    """Folder of the CLIP text model, which a prompt needs."""
     at_step: int = 0
     """Training step before which the views are generated. Later, the splats themselves show what is seen and how far it is."""
     context_views: int = 16
     """Captured views that the model is conditioned on; fewer when the capture has fewer."""
-    context_choice: Literal["spread", "stride"] = "spread"
-    """Take context views that differ most in place and direction, or every so many (the paper's choice)."""
+    context_choice: Literal["spread", "stride", "overlap"] = "spread"
+    """Context views that differ most in place and direction, or every so many (the paper's choice); overlap: those for the anchors, and
+    for each later round the views that show most of what its cameras will show."""
     anchor_views: int = 24
     """Views generated together in the first round."""
     densify_rounds: int = 3
     """Rounds after the anchors, each conditioned on the context and the anchors."""
     densify_views: int = 24
     """Views generated together in each of these rounds."""
+    camera_path: Path | None = None
+    """Camera path saved in nerfstudio's viewer (Render tab): generate these views, where they are, instead of placing cameras."""
+    masked: MaskedConfig = field(default_factory=MaskedConfig)
+    """Which captured pictures are inpainted."""
     image_size: int | None = None
     """Side of the square views in pixels; None is the size the model was trained at."""
     steps: int | None = None
@@ -56,6 +87,8 @@ class CompletionConfig:
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says nothing)."""
     guidance_known: float | None = None
     """Guidance scale in known pixels; None is what the model's folder recommends (the paper's 1.1 where it says nothing)."""
+    window: int | None = None
+    """Views denoised together, averaged over random windows, for sequences longer than the model likes; None is all of them."""
     memory_budget: float | None = None
     """Most memory that a pass of the model may take, weights included, in GiB; None is what the machine has. The work is cut to fit."""
     cache_dir: Path | None = None
@@ -85,9 +118,18 @@ class CompletionConfig:
             ("densify_rounds", 0),
             ("densify_views", 0),
             ("steps", 2),
+            ("window", 1),
         ):
             if getattr(self, name) is not None and getattr(self, name) < least:
                 raise ValueError(f"completion.{name}: expected at least {least}, got {getattr(self, name)}")
+        if self.inpainter == "diffusion" and self.inpainter_weights is not None:
+            raise ValueError(
+                "completion.inpainter_weights: weights of a 2D inpainter need completion.inpainter grid; set it, or leave them out"
+            )
+        if self.inpainter == "grid" and self.task != "inpaint":
+            raise ValueError(
+                "completion.inpainter grid: a 2D inpainter knows no cameras and cannot generate new views; set completion.task inpaint"
+            )
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         if not 0.0 <= self.generated_share <= 1.0:
@@ -99,7 +141,11 @@ class CompletionConfig:
 
     def sampling(self, recommended: SamplingConfig = SamplingConfig()) -> SamplingConfig:
         """How to sample: these options where they are given, the model's recommendation elsewhere."""
-        given = {name: getattr(self, name) for name in ("steps", "guidance_unknown", "guidance_known") if getattr(self, name) is not None}
+        given = {
+            name: getattr(self, name)
+            for name in ("steps", "guidance_unknown", "guidance_known", "window")
+            if getattr(self, name) is not None
+        }
         if self.memory_budget is not None:
             given["memory_budget_bytes"] = int(self.memory_budget * 2**30)
         return dataclasses.replace(recommended, **given)

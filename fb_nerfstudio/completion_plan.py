@@ -6,7 +6,9 @@ knows nerfstudio.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +29,10 @@ from fb_core.geometry.paths import (
     strided_subset,
 )
 from fb_core.geometry.shell import Shell, fit_shell
+from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completed_views import ANCHOR, DENSIFY
 from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
+from fb_nerfstudio.context_views import nearest_context
 
 _ANCHOR_LEVELS, _DENSIFY_LEVELS = 2, 3
 _SEEN_NEED = 0.2  # looking at what the capture has seen is worth this much of looking at what it has not
@@ -42,11 +46,17 @@ class PlannedRound:
     number: int
     """Counted from 0, the anchors."""
     role: str
-    """``anchor`` or ``densify``."""
+    """``anchor``, ``densify``, ``requested`` or ``inpainted``."""
     seed: int
     """Decides the images."""
     cameras: Pinholes
     """The new views' cameras."""
+    prompt: str = ""
+    """What is to be seen, for models that read text."""
+    context: tuple[int, ...] | None = None
+    """Captured views that condition this round, the most level first; None is all that condition any."""
+    aspect: float = 1.0
+    """Width over height of the part of the square views that is trained on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +70,7 @@ class CompletionPlan:
     captured: int
     """Views the capture has."""
     context: tuple[int, ...]
-    """Indices of the captured views that condition every round; the most level first."""
+    """Indices of the captured views that condition the rounds; the most level first."""
     rounds: tuple[PlannedRound, ...]
     """Anchors first."""
     size: int
@@ -71,13 +81,18 @@ class CompletionPlan:
         """How many views will be generated."""
         return sum(len(one.cameras) for one in self.rounds)
 
+    def context_of(self, planned: PlannedRound) -> tuple[int, ...]:
+        """Places in ``context`` of the views that condition a round."""
+        return tuple(range(len(self.context)) if planned.context is None else map(self.context.index, planned.context))
+
 
 def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None, config: CompletionConfig, *, size: int) -> CompletionPlan:
     """Choose context views and new cameras.
 
     Anchors stand on a cylinder of the capture's own centre, up and radius. In captures that look outward (rooms) each looks
     where the capture and the views before it looked least; in captures that look inward (objects) each looks at a random
-    point around the focus. No camera is placed outside the guessed surface or nearer to a seen point than the clearance.
+    point around the focus. No camera is placed outside the guessed surface or nearer to a seen point than the clearance. With
+    ``config.camera_path`` the views of that path are taken as they are.
 
     Args:
         cameras: the captured cameras, one per entry (sizes may differ).
@@ -87,15 +102,28 @@ def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None
     """
     cameras = [camera.to("cpu", torch.float32) for camera in cameras]
     shape = CaptureShape.of(cameras)
-    points = _thinned(points, shape)
-    site = _Site(shape=shape, shell=_shell_of(shape, points), points=points, cameras=cameras, placement=config.placement)
+    points = thinned_points(points, shape)
+    site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, placement=config.placement)
     count = config.context_views
-    context = spread_subset(cameras, count) if config.context_choice == "spread" else strided_subset(len(cameras), count)
-    # The new views have the scale of the fitted context views: one lens for the whole sequence, as in training.
-    focal = float(torch.stack([cameras[i].focal.mean() * size / max(cameras[i].width, cameras[i].height) for i in context]).median())
-    half_angle = math.atan(size / 2 / focal)
+    context = strided_subset(len(cameras), count) if config.context_choice == "stride" else spread_subset(cameras, count)
+    rounds = _placed_rounds(site, context, config, size) if config.camera_path is None else _path_rounds(config, size)
+    if config.context_choice == "overlap":
+        rounds = [_with_own_context(one, context, site, count) for one in rounds]
+    used = dict.fromkeys([*context, *(index for one in rounds for index in one.context or ())])
+    return CompletionPlan(shape=shape, shell=site.shell, captured=len(cameras), context=tuple(used), rounds=tuple(rounds), size=size)
+
+
+def _with_own_context(planned: PlannedRound, context: Sequence[int], site: _Site, count: int) -> PlannedRound:
+    """The round with the views that show most of what its cameras will show; anchors look everywhere and keep the common ones."""
+    near = context if planned.role == ANCHOR else nearest_context(site.cameras, planned.cameras, site.shell, count)
+    return dataclasses.replace(planned, context=tuple(near))
+
+
+def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig, size: int) -> list[PlannedRound]:
+    """Anchors, then rounds of densified views, placed where the capture needs them."""
+    half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
     need = site.need()
-    generator = torch.Generator().manual_seed(_round_seed(config.seed, -1))
+    generator = torch.Generator().manual_seed(round_seed(config.seed, -1))
     rounds = []
     for number, views in enumerate([config.anchor_views] + [config.densify_views] * config.densify_rounds):
         if views == 0:
@@ -103,9 +131,41 @@ def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None
         role = ANCHOR if number == 0 else DENSIFY
         centers = site.centers(role, views, generator)
         targets, need = site.targets(centers, need, half_angle, generator)
-        new = Pinholes.looking_at(centers, targets, up=shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size)
-        rounds.append(PlannedRound(number=number, role=role, seed=_round_seed(config.seed, number), cameras=new))
-    return CompletionPlan(shape=shape, shell=site.shell, captured=len(cameras), context=tuple(context), rounds=tuple(rounds), size=size)
+        new = Pinholes.looking_at(centers, targets, up=site.shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size)
+        rounds.append(PlannedRound(number=number, role=role, seed=round_seed(config.seed, number), cameras=new, prompt=config.prompt))
+    return rounds
+
+
+def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:
+    """The views of a person's camera path, none of them moved: equally spaced ones first, as anchors, then what lies between.
+
+    Where the path has more views than anchors and rounds may have together, equally spaced ones are taken.
+    """
+    assert config.camera_path is not None
+    path = read_camera_path(config.camera_path, size=size)
+    most = config.anchor_views + config.densify_rounds * config.densify_views
+    taken = strided_subset(len(path.cameras), most)
+    anchors = strided_subset(len(taken), config.anchor_views)
+    rest = [index for place, index in enumerate(taken) if place not in set(anchors)]
+    needed = -(-len(rest) // max(config.densify_views, 1))
+    groups = [[taken[place] for place in anchors], *(rest[first::needed] for first in range(needed))]
+    return [
+        PlannedRound(
+            number=number,
+            role=ANCHOR if number == 0 else DENSIFY,
+            seed=round_seed(config.seed, number),
+            cameras=path.cameras[group],
+            prompt=config.prompt,
+            aspect=path.aspect,
+        )
+        for number, group in enumerate(groups)
+        if group
+    ]
+
+
+def lens_of(cameras: Sequence[Pinholes], context: Sequence[int], size: int) -> float:
+    """Focal length in pixels of new square views: the scale of the fitted context views, one lens for all as in training."""
+    return float(torch.stack([cameras[i].focal.mean() * size / max(cameras[i].width, cameras[i].height) for i in context]).median())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +229,7 @@ class _Site:
         return centers + looks * max(self.shape.radius, 1.0), need
 
 
-def _thinned(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, "m 3"]:
+def thinned_points(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, "m 3"]:
     """At most a few thousand finite points on the CPU."""
     if points is None:
         return shape.center.new_empty(0, 3)
@@ -178,12 +238,12 @@ def _thinned(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, "m 3"]
     return points[torch.linspace(0, len(points) - 1, min(len(points), _PLANNING_POINTS)).long()]
 
 
-def _shell_of(shape: CaptureShape, points: Tensor) -> Shell:
+def shell_of(shape: CaptureShape, points: Tensor) -> Shell:
     """The surface all around; without points, a sphere that leaves the cameras room."""
     guess = (3.0 if shape.outward else 2.0) * shape.radius
     return fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up)
 
 
-def _round_seed(seed: int, number: int) -> int:
+def round_seed(seed: int, number: int) -> int:
     """An independent seed for each round."""
     return int(np.random.SeedSequence([seed % 2**63, number + 1]).generate_state(1, np.uint64)[0] >> np.uint64(1))
