@@ -27,6 +27,7 @@ from fb_nerfstudio.seams import without_seams
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
 _FIRM = 0.75  # accumulation from which splats beside the captured pictures are believed
+_OPAQUE = 0.95  # accumulation from which a render's colour is that of the splats, without the background
 _BESIDE = 0.5  # how far beside, as a part of the picture's side
 TRAINED_STEPS = 100
 """Steps after which the splats' own depth and accumulation are believed."""
@@ -131,16 +132,16 @@ def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendere
     """The views with colours that meet the splats' where the capture has seen them (:mod:`fb_nerfstudio.seams`)."""
     images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
     size = images.shape[2:]
-    reliable = ~unseen.mask & (rendered.accumulation >= _FIRM)
+    reliable = ~unseen.mask & (rendered.accumulation >= _OPAQUE)
     colors = F.interpolate(rendered.rgb, size=size, mode="bilinear", align_corners=False)
     matched = without_seams(images, colors, F.interpolate(reliable[:, None].float(), size=size, mode="nearest")[:, 0] > 0)
     return dataclasses.replace(views, images=rearrange((matched * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous())
 
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
-    """The views with masks that leave only their unseen pixels. No seam: generated pixels would blur what was captured."""
+    """The views with masks that leave only their unseen pixels, of those they left before. No seam: generated pixels would blur what was captured."""
     masks = F.interpolate(unseen.mask[:, None].float(), size=views.images.shape[1:3], mode="nearest") > 0
-    return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1"))
+    return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1") & views.masks)
 
 
 def unseen_gaussians(
