@@ -191,7 +191,7 @@ def test_a_low_strength_stays_near_the_current_views_and_a_high_one_does_not(mod
 
 def test_strength_costs_only_the_steps_that_are_left(model):
     seen = []
-    sampling = SamplingConfig(steps=10, strength=0.5)
+    sampling = SamplingConfig(steps=10, strength=0.5, shift=1.0)
     model.complete(mixed_views(), generator=seeded(), sampling=sampling, current=current_views(), on_step=lambda *at: seen.append(at))
     assert seen[-1] == (5, 5)
 
@@ -228,7 +228,7 @@ def test_an_interrupted_completion_goes_on_to_the_same_bits(model, options):
 
 def test_progress_tells_step_time_and_a_cheap_preview(model):
     seen = []
-    model.complete(mixed_views(), generator=seeded(), sampling=dataclasses.replace(QUICK, steps=4), on_progress=seen.append)
+    model.complete(mixed_views(), generator=seeded(), sampling=dataclasses.replace(QUICK, steps=4, shift=1.0), on_progress=seen.append)
     assert [(at.step, at.steps, at.time) for at in seen] == [(1, 4, 0.75), (2, 4, 0.5), (3, 4, 0.25), (4, 4, 0.0)]
     preview = seen[-1].preview()
     assert preview.shape == (5, 3, 4, 4) and 0 <= preview.min() and preview.max() <= 1
@@ -262,12 +262,12 @@ def test_reference_compatible_is_the_original_s_way_not_ours(model):
     views = mixed_views()
     options = {"steps": 3, "guidance_unknown": 7.0}
     original = model.complete(views, generator=seeded(), sampling=SamplingConfig(reference_compatible=True, **options))
-    same_grid = model.complete(views, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", **options))
+    same_grid = model.complete(views, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", shift=1.0, **options))
     assert not torch.allclose(original.images, same_grid.images, atol=1e-3), "the guidance map lands on other views"
     even = {"steps": 3, "guidance_unknown": 2.0, "guidance_known": 2.0}
     one_view = mixed_views(0, 1, 0)
     original = model.complete(one_view, generator=seeded(), sampling=SamplingConfig(reference_compatible=True, **even))
-    same_grid = model.complete(one_view, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", **even))
+    same_grid = model.complete(one_view, generator=seeded(), sampling=SamplingConfig(solver="euler", grid="reference", shift=1.0, **even))
     assert torch.allclose(original.images, same_grid.images, atol=1e-5), "one view under one scale has nothing to scramble"
 
 
