@@ -191,9 +191,10 @@ def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainte
     there = "" if done is None else f"; {len(done)} of these views are there already"
     along = "" if config.camera_path is None else f" along {config.camera_path.name}"
     sequence = context + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
+    passes = f"{len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views"
     return (
         f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
-        f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views, "
+        f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {passes}, "
         f"conditioned on {context} of {plan.captured} captured views{asked}{there}."
     )
 

@@ -130,6 +130,8 @@ class CompletionConfig:
             raise ValueError(
                 "completion.inpainter grid: a 2D inpainter knows no cameras and cannot generate new views; set completion.task inpaint"
             )
+        if self.camera_path is not None and self.task != "new-views":
+            raise ValueError("completion.camera_path: inpainting places no camera; set completion.task new-views, or leave the path out")
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         if not 0.0 <= self.generated_share <= 1.0:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -75,21 +76,32 @@ def run_inpainting(
     if done is not None and len(done):
         return
     (planned,) = plan.rounds
-    told = [_dilated(view.known, config.masked.dilate) for view in context]
-    _refuse_nothing_to_do(context, told)
-    fitted = [fitted_view(dataclasses.replace(view, known=mask), plan.size) for view, mask in zip(context, told, strict=True)]
+    told, fitted = [], []
+    for view in context:  # pictures are large: one at a time
+        given = _dilated(view.known, config.masked.dilate)
+        told.append(_Told(whole=bool((given == 1).all()), nothing=not bool((given == 1).any()), size=(given.shape[1], given.shape[2])))
+        fitted.append(fitted_view(dataclasses.replace(view, known=given), plan.size))
+    _refuse_nothing_to_do(told)
     squares = round_images(Views.cat(fitted), planned, model, config, open_cache(config), on_step, on_found)
     origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash)
-    height, width = (max(view.image.shape[axis] for view in context) for axis in (1, 2))
+    largest = max(one.size[0] for one in told), max(one.size[1] for one in told)
     copies = []
-    for view, given, square in zip(context, told, squares, strict=True):
-        supervised = given < 1
-        if not bool(supervised.any()):
-            continue
-        image = pasted(view, square.permute(2, 0, 1).float() / 255)
+    for place in (place for place, one in enumerate(told) if not one.whole):
+        view = context[place]
+        image = pasted(view, squares[place].permute(2, 0, 1).float() / 255)
+        supervised = _dilated(view.known, config.masked.dilate) < 1
         mask = supervised if config.generated_pixels == "unseen" else torch.ones_like(supervised)
-        copies.append(_copy(image, mask, view.camera, origin, (height, width)))
+        copies.append(_copy(image, mask, view.camera, origin, largest))
     yield CompletedViews.cat(copies)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Told:
+    """What the model is told of a picture."""
+
+    whole: bool
+    nothing: bool
+    size: tuple[int, int]
 
 
 def pasted(view: CapturedView, square: Float[Tensor, "3 s s"]) -> Float[Tensor, "3 h w"]:
@@ -106,18 +118,16 @@ def pasted(view: CapturedView, square: Float[Tensor, "3 s s"]) -> Float[Tensor, 
     return torch.where(known, image, without_seams(generated, image[None], known)[0])
 
 
-def announcement_of_inpainting(plan: CompletionPlan, config: CompletionConfig, model: Inpainter, context: Sequence[CapturedView]) -> str:
+def announcement_of_inpainting(plan: CompletionPlan, config: CompletionConfig, model: Inpainter) -> str:
     """One sentence on what is about to be inpainted."""
-    unknown = 1 - sum(float(_dilated(view.known, config.masked.dilate).mean()) for view in context) / len(context)
-    asked = "" if len(context) >= config.masked.views else f" (asked for {config.masked.views}; the capture has no more)"
+    asked = "" if len(plan.context) >= config.masked.views else f" (asked for {config.masked.views}; the capture has no more)"
     sampling = config.sampling(model.recommended_sampling)
     how = "without diffusion" if getattr(model, "weight_free", False) else f"in one pass of {sampling.steps} steps"
     windows = "" if sampling.window is None else f" in windows of {sampling.window} views"
-    rim = f", a rim of {config.masked.dilate} pixels included" if config.masked.dilate else ""
+    rim = f", holes grown by {config.masked.dilate} pixels" if config.masked.dilate else ""
     return (
-        f"Inpainting {len(context)} equally spaced of {plan.captured} captured views{asked} with {model_name(config, model)} "
-        f"({model.model_hash[:8]}) {how}{windows} at {plan.size}x{plan.size} pixels; "
-        f"{100 * unknown:.1f} % of their pixels are unknown{rim}."
+        f"Inpainting {len(plan.context)} equally spaced of {plan.captured} captured views{asked} with {model_name(config, model)} "
+        f"({model.model_hash[:8]}) {how}{windows} at {plan.size}x{plan.size} pixels{rim}."
     )
 
 
@@ -126,17 +136,18 @@ def _dilated(known: Float[Tensor, "1 h w"], pixels: int) -> Float[Tensor, "1 h w
     return grow_hole((known > 0.5).float()[None], pixels=pixels)[0]
 
 
-def _refuse_nothing_to_do(context: Sequence[CapturedView], told: Sequence[Tensor]) -> None:
-    pictures = f"the {len(context)} pictures that were chosen have" if len(context) > 1 else "the only picture has"
-    if all(bool((mask == 1).all()) for mask in told):
+def _refuse_nothing_to_do(told: Sequence[_Told]) -> None:
+    pictures = f"the {len(told)} pictures that were chosen have" if len(told) > 1 else "the only picture has"
+    if all(one.whole for one in told):
         raise ValueError(
             f"completion.task inpaint: {pictures} no unknown pixels; give masks that are black where something is to be inpainted, "
             "or complete the scene with new views (ns-train fillerbuster)"
         )
-    if not any(bool((mask == 1).any()) for mask in told):
-        black = not any(bool((view.known > 0.5).any()) for view in context)
-        cause = "are black everywhere" if black else "leave nothing known beyond the dilated rim"
-        raise ValueError(f"completion.task inpaint: the masks {cause}; white marks pixels that are known, black those to inpaint")
+    if all(one.nothing for one in told):
+        raise ValueError(
+            f"completion.task inpaint: {pictures} no known pixels (beyond the dilated rim); masks are white where pixels are known and "
+            "black where they are to be inpainted"
+        )
 
 
 def _fitted_camera(camera: Pinholes, size: int) -> Pinholes:

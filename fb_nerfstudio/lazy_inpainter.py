@@ -15,9 +15,9 @@ from fb_core.views import Views
 class LazyInpainter:
     """What a completion needs of ``Fillerbuster``. Size, options and hash come from the folder, weights only when they must work."""
 
-    def __init__(self, folder: Path | None, device: torch.device | str):
+    def __init__(self, folder: Path | None, device: torch.device | str, *, text_encoder: Path | None = None):
         """``folder`` None is the bundled model. Raises ValueError for a folder that is no model."""
-        self._folder, self._device = folder, device
+        self._folder, self._device, self._text_encoder = folder, device, text_encoder
         self._model: Fillerbuster | None = None
         path = BUNDLED_MODEL if folder is None else folder
         self._info = checkpoint.read_config(path)[1]
@@ -49,5 +49,5 @@ class LazyInpainter:
     ) -> Views:
         """``Fillerbuster.complete``; the first call loads the weights. Raises ValueError when they are broken."""
         if self._model is None:
-            self._model = Fillerbuster.from_pretrained(self._folder, device=self._device)
+            self._model = Fillerbuster.from_pretrained(self._folder, device=self._device, text_encoder=self._text_encoder)
         return self._model.complete(views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt)

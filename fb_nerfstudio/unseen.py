@@ -139,7 +139,7 @@ def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendere
 
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
-    """The views with masks that leave only unseen pixels of those they left before. No seam: generated pixels would blur what was captured."""
+    """The views with masks that leave only unseen pixels of what they left. No seam: generated pixels would blur captured ones."""
     masks = F.interpolate(unseen.mask[:, None].float(), size=views.images.shape[1:3], mode="nearest") > 0
     return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1") & views.masks)
 

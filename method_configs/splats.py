@@ -1,4 +1,4 @@
-"""nerfstudio methods: `fillerbuster`, and `fillerbuster-none`, the same without completion.
+"""nerfstudio methods: `fillerbuster`, its baseline without completion, the paper's protocols, and a 2D baseline.
 
 The TrainerConfigs are built from parts: nerfstudio discovers plugins in the middle of importing its own
 `configs.method_configs`, which therefore must not be imported here. This module is paid by every `ns-*` command.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
@@ -91,12 +91,43 @@ def _trainer() -> TrainerConfig:
     )
 
 
-def without_completion(config: TrainerConfig, method_name: str) -> TrainerConfig:
-    """A copy under another name whose datamanager generates nothing; everything else is equal."""
+def with_completion(config: TrainerConfig, method_name: str, **options: Any) -> TrainerConfig:
+    """A copy under another name with other options of its completion; everything else is equal."""
     other = copy.deepcopy(config)
     other.method_name = method_name
     datamanager: Any = other.pipeline.datamanager
-    datamanager.completion = dataclasses.replace(datamanager.completion, enabled=False)
+    datamanager.completion = dataclasses.replace(datamanager.completion, **options)
+    return other
+
+
+def without_completion(config: TrainerConfig, method_name: str) -> TrainerConfig:
+    """A copy under another name whose datamanager generates nothing; everything else is equal."""
+    return with_completion(config, method_name, enabled=False)
+
+
+def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> TrainerConfig:
+    """A copy under another name that is optimised as the authors did (paper, section 3.2 and their released options).
+
+    Gaussians start at random in a cube and have no harmonics; the loss is L1 alone; generated views are there from the first step, are
+    trained on wholly and take half of the steps; nothing of ours mends them.
+    """
+    other = with_completion(
+        config,
+        method_name,
+        at_step=0,
+        context_choice="stride",
+        densify_rounds=4,
+        generated_share=0.5,
+        generated_pixels="all",
+        match_colors=False,
+        seed_gaussians=False,
+    )
+    datamanager, model = cast(Any, other.pipeline.datamanager), cast(Any, other.pipeline.model)
+    datamanager.start_points = 0
+    datamanager.dataparser.load_3D_points = False
+    steps = {"stop_screen_size_at": _ITERATIONS, "stop_split_at": _ITERATIONS}
+    chosen = {"random_init": True, "sh_degree": 0, "ssim_lambda": 0.0, "num_downscales": 0, "use_scale_regularization": True}
+    other.pipeline.model = dataclasses.replace(model, **chosen, **steps)
     return other
 
 
@@ -107,4 +138,23 @@ fillerbuster = MethodSpecification(
 fillerbuster_none = MethodSpecification(
     config=without_completion(fillerbuster.config, "fillerbuster-none"),
     description="The splats of fillerbuster on the captured views only (baseline).",
+)
+fillerbuster_paper = MethodSpecification(
+    config=optimized_as_in_the_paper(fillerbuster.config, "fillerbuster-paper"),
+    description="Complete a casual capture and optimise as the paper's authors did: random start, no harmonics, L1 alone.",
+)
+fillerbuster_cat3d_size = MethodSpecification(
+    # No anchors: CAT3D's model has no room for them beside its conditioning.
+    config=with_completion(
+        fillerbuster.config, "fillerbuster-cat3d-size", context_views=3, anchor_views=0, densify_rounds=20, densify_views=6
+    ),
+    description="The paper's baseline with CAT3D's sequence size: 3 conditioning views, 20 rounds of 6 new ones.",
+)
+fillerbuster_masked = MethodSpecification(
+    config=with_completion(fillerbuster.config, "fillerbuster-masked", task="inpaint", at_step=0, seed_gaussians=False),
+    description="Inpaint what masks leave unknown in 32 captured views, together and once, then train splats (NeRFiller's protocol).",
+)
+nerfiller_grid = MethodSpecification(
+    config=with_completion(fillerbuster_masked.config, "nerfiller-grid", inpainter="grid"),
+    description="fillerbuster-masked with a 2D inpainter on 2x2 grids of views: diffusers' from a folder, or OpenCV's without weights.",
 )

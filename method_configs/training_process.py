@@ -16,7 +16,7 @@ Report = Callable[[str, int, int], None]
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
 _TRAINING_STEP = re.compile(r"(\d+) \(\d+\.\d+%\)")
-_DENOISING_STEP = re.compile(r"(?:Anchors|Round (\d+)): \d+ views\D*?(\d+)/(\d+)\s")
+_DENOISING_STEP = re.compile(r"(?:Anchors|Inpainted|Round (\d+)): \d+ views\D*?(\d+)/(\d+)\s")
 _WINDOW = 4000  # characters that are searched for the latest progress
 
 
