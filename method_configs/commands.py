@@ -1,4 +1,4 @@
-"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, bench, eval, check.
+"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, export, bench, eval, check.
 
 Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
 """
@@ -131,6 +131,29 @@ def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path(
     write_sheet(run, output)
 
 
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    format: Literal["nerfstudio", "colmap"],
+    output: Path | None = None,
+    held_out: bool = True,
+    overwrite: bool = False,
+) -> None:
+    """Write the completed capture of a run, captured and generated views, as a dataset for other tools.
+
+    Args:
+        run: Folder of the run, which holds config.yml; finished, or killed after it had generated views.
+        format: nerfstudio writes transforms.json, colmap a model in sparse/0.
+        output: Folder of the dataset; by default export-nerfstudio or export-colmap in the run's folder.
+        held_out: Also write the captured views that the run did not train on; lists tell them apart.
+        overwrite: Replace an earlier export there.
+    """
+    from method_configs.export_command import export_run
+
+    export_run(run, format=format, output=output, held_out=held_out, overwrite=overwrite)
+
+
 def bench(
     *,
     benchmark: tyro.conf.OmitArgPrefixes[
@@ -195,6 +218,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "convert": convert,
     "demo": demo,
     "sheet": sheet,
+    "export": export,
     "bench": bench,
     "eval": evaluate,
     "check": check,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,7 @@ def load_run(run: Path) -> Any:
 
     Raises ValueError when there is no run in the folder, when it has no checkpoint yet, and when it is of another method.
     """
-    if not (run / "config.yml").is_file():
-        raise ValueError(f"run {run}: no config.yml there; give the folder that ns-train has made (output/experiment/method/time)")
-    if not any((run / "nerfstudio_models").glob("*.ckpt")):
-        raise ValueError(f"run {run}: it has no checkpoint yet; let it train on")
+    _latest_checkpoint(run)
     from nerfstudio.utils.eval_utils import eval_setup
 
     from fb_nerfstudio.datamanager import FillerbusterDataManager
@@ -41,3 +39,30 @@ def load_run(run: Path) -> Any:
         name = type(pipeline.datamanager).__name__
         raise ValueError(f"run {run}: expected a run of fillerbuster or fillerbuster-none, got one with {name}")
     return pipeline
+
+
+def read_run(run: Path) -> tuple[Any, dict[str, Any]]:
+    """Trainer config and latest checkpoint of a run, on the CPU; nothing is built from them.
+
+    Raises ValueError when there is no run in the folder, and when it has no checkpoint yet or a broken one.
+    """
+    path = _latest_checkpoint(run)
+    import torch
+    import yaml
+
+    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    try:
+        return config, torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(
+            f"run {run}: its checkpoint {path.name} cannot be read ({error}); restore it, or remove it for the one before"
+        ) from error
+
+
+def _latest_checkpoint(run: Path) -> Path:
+    if not (run / "config.yml").is_file():
+        raise ValueError(f"run {run}: no config.yml there; give the folder that ns-train has made (output/experiment/method/time)")
+    checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
+    if not checkpoints:
+        raise ValueError(f"run {run}: it has no checkpoint yet; let it train on")
+    return checkpoints[-1]

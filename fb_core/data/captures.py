@@ -8,8 +8,6 @@ reading and writing bit for bit.
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +31,7 @@ from fb_core.data.transforms_json import (
     to_json,
 )
 from fb_core.data.undistort import check_lens, undistort
+from fb_core.data.whole_folder import whole_folder
 from fb_core.geometry.cameras import Pinholes
 
 FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
@@ -257,18 +256,12 @@ def write_capture(
         if not (folder / JSON_NAME).is_file():  # never sweep away a folder that is something else
             raise ValueError(f"write_capture: {folder} holds other things than a capture (no {JSON_NAME}); choose another folder")
     _check_to_write(frames, extra)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = folder.parent / f".{folder.name}.{secrets.token_hex(4)}"
-    unfinished.mkdir()
-    try:
+    with whole_folder(folder) as unfinished:
         written = tuple(_write_frame(frame, unfinished, any(one.mask is not None for one in frames)) for frame in frames)
         if points is not None:
             write_points(unfinished / "points3D.ply", points)
         points_path = None if points is None else unfinished / "points3D.ply"
         write_transforms(Capture(root=unfinished, frames=written, points_path=points_path, extra=extra), unfinished)
-        _put_in_place(unfinished, folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
     return read_capture(folder)
 
 
@@ -356,18 +349,3 @@ def _write_frame(frame: FrameToWrite, folder: Path, with_mask: bool) -> Frame:
         mask = torch.ones_like(frame.image[:1]) if frame.mask is None else frame.mask
         media.write_image(mask_path, (mask >= 0.5).to(frame.image))
     return Frame(image_path=image_path, mask_path=mask_path if with_mask else None, camera=frame.camera, extra=frame.extra)
-
-
-def _put_in_place(finished: Path, folder: Path) -> None:
-    """Renames a finished folder to its name; what was there is moved aside first and removed last."""
-    if not folder.exists():
-        os.replace(finished, folder)
-        return
-    aside = finished.with_name(f"{finished.name}.old")
-    os.replace(folder, aside)
-    try:
-        os.replace(finished, folder)
-    except OSError:
-        os.replace(aside, folder)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +31,23 @@ class Points:
 
     def __len__(self) -> int:
         return self.positions.shape[0]
+
+
+def read_points(path: str | Path) -> Points:
+    """Points of a PLY file (or the corners of its mesh); grey where it has no colours. Raises ValueError for what is no such file."""
+    import trimesh
+
+    try:
+        cloud: Any = trimesh.load(str(path), process=False)
+        positions = torch.from_numpy(np.array(cloud.vertices, dtype=np.float64))
+    except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
+        raise ValueError(f"points {path}: not readable as a PLY file ({error}); restore it") from error
+    colors = getattr(cloud, "colors", None)
+    if colors is None and getattr(getattr(cloud, "visual", None), "kind", None) == "vertex":
+        colors = cloud.visual.vertex_colors
+    if colors is None or len(colors) != len(positions):
+        return Points(positions=positions, colors=torch.full_like(positions, 0.5))
+    return Points(positions=positions, colors=torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255)
 
 
 def write_points(path: str | Path, points: Points) -> None:

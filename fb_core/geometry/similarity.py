@@ -1,0 +1,70 @@
+"""Similarities between two worlds: a rotation, a scale and a shift, in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+
+_ONE_PLACE = 1e-6  # of the largest coordinate: spread that float32 cannot tell from none
+
+
+@dataclass(frozen=True, kw_only=True)
+class Similarity:
+    """``y = scale * rotation @ x + shift`` from one world to another; float64."""
+
+    rotation: Float[Tensor, "3 3"]
+    """A proper rotation."""
+    scale: float
+    """Above 0; units of the second world per unit of the first."""
+    shift: Float[Tensor, " 3"]
+    """Where the first world's origin is in the second."""
+
+    @staticmethod
+    def between(
+        first: tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]],
+        second: tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]],
+        *,
+        scale_of_one_place: float = 1.0,
+    ) -> Similarity:
+        """The one that takes cameras (camera-to-world rotations, centres) of a world to the same cameras in another.
+
+        Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is the one given.
+        """
+        (rotations, centers), (their_rotations, their_centers) = first, second
+        rotations, centers, their_rotations, their_centers = (x.double() for x in (rotations, centers, their_rotations, their_centers))
+        rotation = nearest_rotations(torch.einsum("nij,nkj->ik", their_rotations, rotations)[None])[0]
+        spread, their_spread = centers - centers.mean(dim=0), (their_centers - their_centers.mean(dim=0)) @ rotation
+        scale = scale_of_one_place
+        if float(spread.abs().max()) > _ONE_PLACE * (1.0 + float(centers.abs().max())):
+            scale = float((spread * their_spread).sum() / spread.square().sum())
+        shift = their_centers.mean(dim=0) - scale * rotation @ centers.mean(dim=0)
+        return Similarity(rotation=rotation, scale=scale, shift=shift)
+
+    @property
+    def inverse(self) -> Similarity:
+        """From the second world to the first."""
+        return Similarity(rotation=self.rotation.T, scale=1 / self.scale, shift=-(self.rotation.T @ self.shift) / self.scale)
+
+    def points(self, points: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
+        """The same points in the other world."""
+        return self.scale * points.double() @ self.rotation.T + self.shift
+
+    def cameras(self, cameras: Pinholes) -> Pinholes:
+        """The same cameras in the other world, in float64, their rotations made exact."""
+        rotations = nearest_rotations(self.rotation @ cameras.rotations.double())
+        poses = torch.cat([rotations, self.points(cameras.centers)[:, :, None]], dim=2)
+        return dataclasses.replace(cameras.to(torch.float64), camera_to_world=poses)
+
+
+def nearest_rotations(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+    """The proper rotations nearest to matrices in the sum of squares (orthogonal Procrustes)."""
+    left, _, right = torch.linalg.svd(matrices)
+    signs = torch.ones_like(matrices[:, 0])
+    signs[:, 2] = torch.det(left @ right).sign()
+    return (left * signs[:, None, :]) @ right
