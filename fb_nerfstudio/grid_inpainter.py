@@ -83,7 +83,7 @@ class GridInpainter:
             prompt: for pipelines that read text.
         """
         images = torch.where(views.image_known > 0, views.images, torch.zeros_like(views.images)).cpu().float()
-        known = views.image_known.cpu().float()
+        known = views.image_known.cpu().float().clone()
         grids = grids_of((known < 1).flatten(1).any(dim=1).nonzero()[:, 0], generator)
         for number, cells in enumerate(grids):
             seed = int(torch.randint(0, 2**31, (), generator=generator))
