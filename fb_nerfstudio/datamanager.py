@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import logging
 import random
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,15 +26,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
-from fb_nerfstudio.completed_views import CompletedViews
+from fb_nerfstudio.completed_views import REQUESTED, CompletedViews, round_title
 from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
 from fb_nerfstudio.dataparser import without_open3d
+from fb_nerfstudio.grid_inpainter import GridInpainter
+from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
+from fb_nerfstudio.requests import CompleteFrom, RegenerateRound, RemoveView, Request, merged, plan_request, without_view
 from fb_nerfstudio.start_points import start_points
 from fb_nerfstudio.unseen import (
+    SOLID,
     TRAINED_STEPS,
     coarse,
     find_unseen,
@@ -42,10 +48,11 @@ from fb_nerfstudio.unseen import (
     with_matched_colors,
     with_unseen_masks,
 )
-from fb_nerfstudio.viewer import CompletionPanel
+from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
 COMPLETION_FOLDER = "completion"
 """Where in the run's folder the generated views are written as a capture."""
+_SURVEYED_CAMERAS = 48  # captured pictures that are rendered to learn where surfaces are when a request comes
 _logger = logging.getLogger(__name__)
 
 
@@ -93,7 +100,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         if test_mode == "val" and config.start_points > 0 and "points3D_xyz" not in self.train_dataparser_outputs.metadata:
             self._find_start_points()
-        self.completion_panel = CompletionPanel()  # public: nerfstudio's viewer looks for it by type
+        self.completion_panel = CompletionPanel(prompt=config.completion.prompt)  # public: nerfstudio's viewer looks for it by type
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: CompletedViews | None = None
         self._bank_cameras: Cameras | None = None
@@ -175,10 +182,18 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Checks before every iteration whether generated views are due and missing; refuses a broken model folder at once."""
         if self.config.completion.enabled and not self._finished:
             self._check_inpainter()
-        callback = TrainingCallback(
-            [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._complete_when_due, args=[training_callback_attributes]
+        self.completion_panel.training_begins(takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views")
+        before, after, given = (
+            TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
+            TrainingCallbackLocation.AFTER_TRAIN,
+            training_callback_attributes,
         )
-        return [*super().get_training_callbacks(training_callback_attributes), callback]
+        return [
+            *super().get_training_callbacks(given),
+            TrainingCallback([before], self._complete_when_due, args=[given]),
+            TrainingCallback([before], self._serve_next_request, args=[given]),
+            TrainingCallback([after], lambda step: self.completion_panel.training_ended()),
+        ]
 
     def _complete_when_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         completion = self.config.completion
@@ -191,36 +206,85 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
         started = time.perf_counter()
         config, splats, trainer = self.config.completion, _splats_of(attributes), attributes.trainer
-        model = self._load_inpainter()
-        _ = self.cached_train  # undistortion changes the cameras, so it must come first
-        cameras = [camera.to("cpu") for camera in to_pinhole_list(self.train_cameras)]
+        model, cameras = self._load_inpainter(), self._captured_cameras()
         points = self._seen_points(splats, cameras, step)
-        plan = plan_completion(cameras, points, config, size=config.image_size or model.size)
+        inpaints = config.task == "inpaint"
+        make_plan, generate = (plan_inpainting, run_inpainting) if inpaints else (plan_completion, run_completion)
+        plan = make_plan(cameras, points, config, size=config.image_size or model.size)
+        done, _ = _without_requested(self._bank)
         if plan.rounds:
-            CONSOLE.print(announcement(plan, config, model, done=self._bank))
-            context = [self._captured_view(index, cameras[index]) for index in plan.context]
-            left = len(plan.rounds) - (0 if self._bank is None else len(self._bank.rounds))
+            told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
+            CONSOLE.print(told)
+            context = _LazyViews(lambda index: self._captured_view(index, cameras[index]), plan.context)
+            left = len(plan.rounds) - (0 if done is None else len(done.rounds))
             with _Bars(self.completion_panel, len(plan.rounds)) as bars, _refusing():
-                for views in run_completion(plan, context, model, config, done=self._bank, on_step=bars.step, on_found=_say_found):
+                for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=_say_found):
                     left -= 1
-                    self._set_bank(views if self._bank is None else CompletedViews.cat([self._bank, views]))
+                    self._set_bank(merged(self._bank, (), views))
                     if left > 0:
                         _save_checkpoint(trainer, step)
         del model
-        gc.collect()
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
-        added = 0
-        if self._bank is not None:
-            added = self._seed_unseen(self._bank, attributes, plan.shell, cameras, step)
-            folder = None if trainer is None else Path(trainer.base_dir) / COMPLETION_FOLDER
-            if folder is not None:
-                self._bank.save_capture(folder)
+        _release_memory()
+        done, requested = _without_requested(self._bank)
+        if done is not None:
+            done, added = self._seed_unseen(done, attributes, plan.shell, cameras, step)
+            self._set_bank(done if requested is None else CompletedViews.cat([done, requested]))
+            folder = self._save_bank(trainer)
             where = "" if folder is None else f", saved in {folder}"
             seconds = time.perf_counter() - started
-            CONSOLE.print(f"{len(self._bank)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
+            CONSOLE.print(f"{len(done)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
         self._finished = True
         _save_checkpoint(trainer, step)
+
+    def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Do what was asked for in the viewer, one request before each iteration. What cannot be done is said there; training goes on."""
+        request = self.completion_panel.requests.take()
+        if request is None:
+            return
+        try:
+            with _own_randomness(self.device):
+                said = self._serve(request, attributes, step)
+        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+            said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
+            _logger.debug("request %s", request, exc_info=True)
+        _release_memory()
+        CONSOLE.print(said)
+        self.completion_panel.report(said)
+
+    def _serve(self, request: Request, attributes: TrainingCallbackAttributes, step: int) -> str:
+        """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises ValueError."""
+        if isinstance(request, RemoveView):
+            self._set_bank(without_view(self._bank, request.key))
+            said = f"1 view removed; {views_in_words(len(self._bank or ()))} left."
+        else:
+            said = self._generate_requested(request, attributes, step)
+        self._save_bank(attributes.trainer)
+        _save_checkpoint(attributes.trainer, step)
+        return said
+
+    def _generate_requested(self, request: CompleteFrom | RegenerateRound, attributes: TrainingCallbackAttributes, step: int) -> str:
+        """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
+        started = time.perf_counter()
+        config, splats = self.config.completion, _splats_of(attributes)
+        model, cameras = self._load_inpainter(), self._captured_cameras()
+        points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
+        survey = dataclasses.replace(config, anchor_views=0, densify_rounds=0, camera_path=None)
+        scene = plan_completion(cameras, points, survey, size=config.image_size or model.size)
+        planned = plan_request(request, scene, self._bank, cameras, config)
+        context = [self._captured_view(index, cameras[index]) for index in planned.plan.context]
+        with _Bars(self.completion_panel, 1) as bars:
+            (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=_say_found)
+        del model
+        _release_memory()
+        new, added = self._seed_unseen(new, attributes, scene.shell, cameras, step, holes_only=True)
+        self._set_bank(merged(self._bank, planned.replaces, new))
+        title = round_title(new.origins[0].role, new.origins[0].round)
+        seconds = time.perf_counter() - started
+        return f"{title}: {views_in_words(len(new))} in {seconds:.0f} s with seed {new.origins[0].seed}, {added} Gaussians placed in holes."
+
+    def _captured_cameras(self) -> list[Pinholes]:
+        _ = self.cached_train  # undistortion changes the cameras, so it must come first
+        return [camera.to("cpu") for camera in to_pinhole_list(self.train_cameras)]
 
     def _check_inpainter(self) -> None:
         """Raises Refused with one sentence for a model folder that cannot be used."""
@@ -229,7 +293,9 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
     def _load_inpainter(self) -> Inpainter:
         """The diffusion model for the training device. Raises Refused with one sentence when its folder is broken."""
         try:
-            return LazyInpainter(self.config.completion.model, self.device)
+            if self.config.completion.inpainter == "grid":
+                return GridInpainter.of(self.config.completion.inpainter_weights, self.device)
+            return LazyInpainter(self.config.completion.model, self.device, text_encoder=self.config.completion.text_encoder)
         except ValueError as error:
             raise Refused(str(error)) from None
 
@@ -246,27 +312,39 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         return CapturedView(image=batch_image(data, "cpu"), known=batch_known(data, "cpu"), camera=camera)
 
     def _seed_unseen(
-        self, bank: CompletedViews, attributes: TrainingCallbackAttributes, shell: Shell, cameras: list[Pinholes], step: int
-    ) -> int:
-        """Match colours, mask and seed what the capture has not seen; returns the number of new Gaussians."""
+        self,
+        views: CompletedViews,
+        attributes: TrainingCallbackAttributes,
+        shell: Shell,
+        cameras: list[Pinholes],
+        step: int,
+        holes_only: bool = False,
+    ) -> tuple[CompletedViews, int]:
+        """Match colours, mask and seed what the capture has not seen (``holes_only``: where no splats are either).
+
+        Returns the views as they are to be trained on, and the number of new Gaussians.
+        """
         config, splats = self.config.completion, _splats_of(attributes)
+        if config.task == "inpaint":  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
+            return views, 0
         seeds = config.seed_gaussians and hasattr(splats, "add_gaussians")
         if not seeds and config.generated_pixels == "all":
-            return 0
-        rendered = render_geometry(splats, coarse(bank.cameras)) if step >= TRAINED_STEPS else None
-        unseen = find_unseen(bank, cameras, shell, rendered)
+            return views, 0
+        rendered = render_geometry(splats, coarse(views.cameras)) if step >= TRAINED_STEPS else None
+        unseen = find_unseen(views, cameras, shell, rendered)
         if config.match_colors and rendered is not None:
-            bank = with_matched_colors(bank, unseen, rendered)
+            views = with_matched_colors(views, unseen, rendered)
         if config.generated_pixels == "unseen":
-            bank = with_unseen_masks(bank, unseen)
-        self._set_bank(bank)
+            views = with_unseen_masks(views, unseen)
         if not seeds:
-            return 0
+            return views, 0
+        if holes_only and rendered is not None:
+            unseen = dataclasses.replace(unseen, mask=unseen.mask & (rendered.accumulation < SOLID))
         generator = torch.Generator().manual_seed(config.seed)
-        points, colors = unseen_gaussians(bank, unseen, limit=config.max_seed_gaussians, generator=generator)
+        points, colors = unseen_gaussians(views, unseen, limit=config.max_seed_gaussians, generator=generator)
         if len(points) == 0:
-            return 0
-        return splats.add_gaussians(points.to(self.device), colors.to(self.device), attributes.optimizers)
+            return views, 0
+        return views, splats.add_gaussians(points.to(self.device), colors.to(self.device), attributes.optimizers)
 
     # ----------------------------------------------------------------------------------------------------- persistence
 
@@ -275,6 +353,17 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._bank_cameras = None if views is None else to_nerfstudio(views.cameras, self.device)
         self._bank_shares = [] if views is None else views.masks.double().mean(dim=(1, 2, 3)).tolist()
         self.completion_panel.show(views)
+
+    def _save_bank(self, trainer: Any) -> Path | None:
+        """Write the bank as a capture into the run's folder and return where; None without a trainer."""
+        if trainer is None:
+            return None
+        folder = Path(trainer.base_dir) / COMPLETION_FOLDER
+        if self._bank is not None:
+            self._bank.save_capture(folder)
+        elif folder.exists():
+            shutil.rmtree(folder)
+        return folder
 
     def get_extra_state(self) -> dict[str, Any]:
         """The bank and the place in the sequence of draws; lands in the checkpoint as ``datamanager._extra_state``."""
@@ -292,8 +381,25 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
 
 def _say_found(planned: PlannedRound) -> None:
-    title = "Anchors" if planned.role == "anchor" else f"Round {planned.number}"
+    title = round_title(planned.role, planned.number)
     CONSOLE.print(f"{title}: {len(planned.cameras)} views found in the cache, nothing is generated for them.")
+
+
+def _without_requested(bank: CompletedViews | None) -> tuple[CompletedViews | None, CompletedViews | None]:
+    """The automatic views of a bank, and those that were asked for in the viewer; None where there are none."""
+    if bank is None:
+        return None, None
+    asked = [index for index, origin in enumerate(bank.origins) if origin.role == REQUESTED]
+    if not asked:
+        return bank, None
+    other = [index for index in range(len(bank)) if index not in set(asked)]
+    return (bank[other] if other else None), bank[asked]
+
+
+def _release_memory() -> None:
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
 
 
 @contextmanager
@@ -309,6 +415,19 @@ def _splats_of(attributes: TrainingCallbackAttributes) -> Any:
     """The splat model that is being trained."""
     assert attributes.pipeline is not None  # nerfstudio's trainer always gives it
     return attributes.pipeline.model
+
+
+class _LazyViews(Sequence[CapturedView]):
+    """Captured views in order, each read when it is looked at: whole photos as floats would fill the memory."""
+
+    def __init__(self, load: Callable[[int], CapturedView], indices: Sequence[int]):
+        self._load, self._indices = load, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, place: Any) -> Any:
+        return [self._load(index) for index in self._indices[place]] if isinstance(place, slice) else self._load(self._indices[place])
 
 
 class _Bars:
@@ -329,11 +448,11 @@ class _Bars:
 
     def step(self, planned: PlannedRound, done: int, steps: int) -> None:
         """Called by the sampler after each denoising step."""
-        title = f"{'Anchors' if planned.role == 'anchor' else f'Round {planned.number}'}: {len(planned.cameras)} views"
+        title = f"{round_title(planned.role, planned.number)}: {len(planned.cameras)} views"
         if planned.number not in self._tasks:
             self._tasks[planned.number] = self._progress.add_task(title, total=steps)
         self._progress.update(self._tasks[planned.number], completed=done)
-        self._panel.report(f"Generating, {title}, step {done} of {steps}")
+        self._panel.report(f"Generating, {title}, step {done} of {steps}", share=done / steps)
 
 
 @contextmanager

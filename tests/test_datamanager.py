@@ -477,17 +477,45 @@ def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at()
 
 
 class Recorder:
-    """Stands for viser's server: remembers nodes and switches."""
+    """Stands for viser's server: remembers nodes, switches, fields and buttons."""
 
     def __init__(self) -> None:
         self.nodes: dict[str, SimpleNamespace] = {}
         self.boxes: dict[str, SimpleNamespace] = {}
+        self.fields: dict[str, SimpleNamespace] = {}
+        self.bar = SimpleNamespace(value=0.0, visible=False)
+        self.client = SimpleNamespace(atomic=_NoContext, camera=SimpleNamespace(wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 0.0)))
         self.scene = self.gui = self
 
     def _node(self, name, **values):
-        handle = SimpleNamespace(visible=True, remove=lambda: self.nodes.pop(name), on_click=lambda func: func, **values)
-        self.nodes[name] = handle
-        return handle
+        clicks = []
+        values = {"visible": True, "remove": lambda: self.nodes.pop(name), "on_click": clicks.append, "clicks": clicks, **values}
+        self.nodes[name] = SimpleNamespace(**values)
+        return self.nodes[name]
+
+    def _field(self, label, value=None, **values):
+        clicks = []
+        self.fields[label] = SimpleNamespace(value=value, disabled=False, on_click=clicks.append, clicks=clicks, **values)
+        return self.fields[label]
+
+    def add_text(self, label, value, **_):
+        return self._field(label, value)
+
+    add_number = add_text
+
+    def add_button(self, label, **_):
+        return self._field(label)
+
+    def add_dropdown(self, label, options, **_):
+        return self._field(label, options[0], options=options)
+
+    def add_progress_bar(self, value, **_):
+        return self.bar
+
+    def click(self, thing: str) -> None:
+        """On a button or on a frustum, as a person does."""
+        for callback in (self.fields | self.nodes)[thing].clicks:
+            callback(SimpleNamespace(client=self.client))
 
     def add_frame(self, name, **values):
         return self._node(name, **values)
@@ -498,11 +526,11 @@ class Recorder:
     def add_folder(self, label, order=None):
         return _NoContext()
 
-    def add_markdown(self, content):
+    def add_markdown(self, content, order=None):
         self.status = SimpleNamespace(content=content)
         return self.status
 
-    def add_checkbox(self, label, initial_value):
+    def add_checkbox(self, label, initial_value, order=None):
         box = SimpleNamespace(value=initial_value, remove=lambda: self.boxes.pop(label), callbacks=[])
         box.on_update = box.callbacks.append
         self.boxes[label] = box
@@ -540,6 +568,7 @@ def test_frustums_stand_in_one_group_per_round_with_a_switch_each(tiny_capture: 
     manager.completion_panel._setup(viewer)
     server = viewer.viser_server
     assert list(server.boxes) == ["Captured (6)"] and "No generated" in server.status.content
+    assert "Nothing trains here" in server.status.content and all(field.disabled for field in server.fields.values())
     generated(manager)
     assert list(server.boxes) == ["Captured (6)", "Anchors (4)", "Round 1 (2)"]
     assert len([name for name in server.nodes if "view_" in name]) == 6
