@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 _WIDEST_TABLE = 8
 _ALWAYS_SHOWN = (
+    *("method", "room", "covered_psnr", "uncovered_psnr", "uncovered_hole_share", "consistency_psnr"),
+    *("block_psnr", "seconds", "peak_gib"),
     *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )

@@ -21,6 +21,7 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.methods_benchmark import Methods
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -163,6 +164,7 @@ def bench(
         | Annotated[Poses, tyro.conf.subcommand("poses")]
         | Annotated[Splat, tyro.conf.subcommand("splat")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
+        | Annotated[Methods, tyro.conf.subcommand("methods")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""

@@ -51,6 +51,11 @@ class TrainingProcess:
         self._reader.start()
 
     @property
+    def pid(self) -> int:
+        """The process's number."""
+        return self._child.pid
+
+    @property
     def running(self) -> bool:
         """Whether the training has not ended yet."""
         return self._child.poll() is None

@@ -23,9 +23,9 @@ from tiny_models import save_tiny_model
 from fb_core.data import media
 from fb_core.data.captures import FrameToWrite, write_capture
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.refusal import Refused
+from fb_nerfstudio.refusal import Refused, _refuse_prompt
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
-from method_configs.splats import fillerbuster, fillerbuster_none
+from method_configs.splats import fillerbuster, fillerbuster_masked, fillerbuster_none, nerfiller_grid
 
 
 class Started(Exception):
@@ -115,6 +115,62 @@ def test_a_bad_capture_is_refused(kind: str, tiny_capture: Path, model: Path, tm
 @pytest.mark.parametrize("method", [fillerbuster, fillerbuster_none], ids=lambda method: method.config.method_name)
 def test_a_folder_that_is_not_there_is_refused(method, model: Path, tmp_path: Path):
     assert "no such folder" in refusal(config_for(tmp_path / "nowhere", model, tmp_path / "out", method))
+
+
+def blank_masks(folder: Path, value: float) -> None:
+    """All masks of one value, for all pictures."""
+
+    def name_masks(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["mask_path"] = frame["file_path"].replace("images", "masks")
+            media.write_image(folder / frame["mask_path"], torch.full((1, 32, 48), value))
+
+    edit(folder, name_masks)
+
+
+def test_black_masks_are_refused_by_every_method(tiny_capture: Path, model: Path, tmp_path: Path):
+    blank_masks(tiny_capture, 0.0)
+    for method in (fillerbuster, fillerbuster_none, fillerbuster_masked):
+        assert "the masks are black everywhere" in refusal(config_for(tiny_capture, model, tmp_path / "out", method))
+
+
+def test_white_masks_leave_nothing_to_inpaint_and_are_good_otherwise(tiny_capture: Path, model: Path, tmp_path: Path):
+    blank_masks(tiny_capture, 1.0)
+    for method in (fillerbuster_masked, nerfiller_grid):
+        assert "no picture has unknown pixels to inpaint" in refusal(config_for(tiny_capture, model, tmp_path / "out", method))
+    with pytest.raises(Started):
+        ns_train.main(config_for(tiny_capture, model, tmp_path / "out", fillerbuster))
+
+
+def test_masked_captures_are_good_input_of_the_masked_protocol(tiny_capture: Path, model: Path, tmp_path: Path):
+    for method in (fillerbuster_masked, nerfiller_grid):
+        with pytest.raises(Started):
+            ns_train.main(config_for(tiny_capture, model, tmp_path / method.config.method_name, method))
+
+
+def test_panoramas_are_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    edit(tiny_capture, lambda content: content.update(camera_model="EQUIRECTANGULAR"))
+    assert "camera_model 'EQUIRECTANGULAR' is not supported" in refusal(config_for(tiny_capture, model, tmp_path / "out"))
+
+
+def test_a_prompt_that_nobody_reads_is_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    config.pipeline.datamanager.completion.prompt = "a red sofa"
+    assert re.search(r"completion\.prompt: this model reads no text; leave the prompt out", refusal(config))
+    with pytest.raises(ValueError, match=r"completion\.prompt: 'a red sofa' needs a text encoder; .*completion\.text_encoder"):
+        _refuse_prompt(config.pipeline.datamanager.completion, reads_text=True)
+
+
+def test_a_camera_path_of_another_tool_is_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out")
+    config.pipeline.datamanager.completion.camera_path = tiny_capture / "transforms.json"
+    assert "expected a path of nerfstudio's viewer" in refusal(config)
+
+
+def test_weights_of_the_2d_inpainter_that_are_not_there_are_refused(tiny_capture: Path, model: Path, tmp_path: Path):
+    config = config_for(tiny_capture, model, tmp_path / "out", nerfiller_grid)
+    config.pipeline.datamanager.completion.inpainter_weights = tmp_path / "nowhere"
+    assert "no model_index.json there" in refusal(config)
 
 
 def misshape(folder: Path) -> None:

@@ -16,6 +16,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from packaging.requirements import Requirement
 
 from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
+from method_configs import splats
 from method_configs.splats import fillerbuster, fillerbuster_none
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -43,6 +44,56 @@ def test_the_baseline_differs_in_completion_only() -> None:
     }
 
 
+COMPLETION = "pipeline.datamanager.completion."
+VARIANTS = {
+    "fillerbuster-cat3d-size": ("fillerbuster", {"context_views": 3, "anchor_views": 0, "densify_rounds": 20, "densify_views": 6}),
+    "fillerbuster-masked": ("fillerbuster", {"task": "inpaint", "at_step": 0, "seed_gaussians": False}),
+    "nerfiller-grid": ("fillerbuster-masked", {"inpainter": "grid"}),
+}
+
+
+def config_of(method: str) -> TrainerConfig:
+    return getattr(splats, method.replace("-", "_")).config
+
+
+@pytest.mark.parametrize("method", VARIANTS)
+def test_a_protocol_differs_from_its_base_in_its_completion_only(method: str) -> None:
+    base, options = VARIANTS[method]
+    found = differences(config_of(base), config_of(method))
+    assert found.pop("method_name") == (base, method)
+    assert {name: pair[1] for name, pair in found.items()} == {f"{COMPLETION}{name}": value for name, value in options.items()}
+
+
+def test_the_masked_protocol_is_the_papers() -> None:
+    completion = config_of("fillerbuster-masked").pipeline.datamanager.completion
+    assert (completion.masked.views, completion.masked.dilate) == (32, 5) and not completion.seed_gaussians
+
+
+def test_the_papers_optimisation_differs_in_what_the_paper_says() -> None:
+    found = differences(fillerbuster.config, config_of("fillerbuster-paper"))
+    assert found.pop("method_name")[1] == "fillerbuster-paper"
+    changed = {name.rpartition(".")[2]: pair[1] for name, pair in found.items()}
+    steps = fillerbuster.config.max_num_iterations
+    optional = {"num_downscales": 0, "use_scale_regularization": True, "stop_split_at": steps, "stop_screen_size_at": steps}
+    expected = {
+        **{"start_points": 0, "load_3D_points": False, "random_init": True, "sh_degree": 0, "ssim_lambda": 0.0},
+        **{"at_step": 0, "context_choice": "stride", "densify_rounds": 4, "generated_share": 0.5, "generated_pixels": "all"},
+        **{"match_colors": False, "seed_gaussians": False},
+    }
+    assert {name: value for name, value in changed.items() if name not in optional} == expected
+    assert all(changed[name] == value for name, value in optional.items() if name in changed)
+
+
+def test_every_method_is_an_entry_point_under_its_own_name() -> None:
+    import tomllib
+
+    declared = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
+    methods = declared["nerfstudio.method_configs"]
+    assert set(methods) == {"fillerbuster", "fillerbuster-none", "fillerbuster-paper", *VARIANTS}
+    for name, place in methods.items():
+        assert place == f"method_configs.splats:{name.replace('-', '_')}" and config_of(name).method_name == name
+
+
 def test_defaults_that_users_rely_on() -> None:
     config = fillerbuster.config
     assert config.viewer.websocket_host == "127.0.0.1" and not config.viewer.default_composite_depth
@@ -63,10 +114,11 @@ def test_the_command_line_reaches_our_options() -> None:
     assert not config.optimizers["means"]["optimizer"].fused
 
 
-def test_a_config_survives_yaml() -> None:
+@pytest.mark.parametrize("method", ["fillerbuster", "fillerbuster-masked"])
+def test_a_config_survives_yaml(method: str) -> None:
     """nerfstudio writes config.yml as Python objects and every later command reads it back."""
-    again = yaml.load(yaml.dump(fillerbuster.config), Loader=yaml.Loader)
-    assert differences(fillerbuster.config, again) == {}
+    again = yaml.load(yaml.dump(config_of(method)), Loader=yaml.Loader)
+    assert differences(config_of(method), again) == {}
 
 
 @pytest.mark.timeout(180)

@@ -1,0 +1,111 @@
+"""``fillerbuster bench methods``: the captures that it makes, what each run is asked for, its table and bars (a real miniature is slow)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+from nerfstudio.engine.trainer import TrainerConfig
+
+from fb_core.data.captures import read_capture, validate_capture
+from method_configs import methods_benchmark, splats
+from method_configs.methods_benchmark import MASKED, NEW_VIEWS, Methods, arguments_of, bars_of, cut_blocks, means_of, run_methods
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from fb_core.data.room_captures import rooms
+
+    folder = tmp_path_factory.mktemp("rooms") / "plain"
+    rooms(0, folder, views=3, size=32, held_out=2)
+    return folder
+
+
+def test_a_block_is_cut_out_of_captured_pictures_only(plain: Path, tmp_path: Path):
+    cut_blocks(plain, tmp_path / "cut", share=0.5)
+    whole, cut = validate_capture(plain), validate_capture(tmp_path / "cut", decode=True)
+    for before, after in zip(whole.frames, cut.frames, strict=True):
+        mask = after.load_mask()
+        captured = before.image_path.name.startswith("captured")
+        assert int((mask == 0).sum()) == (16 * 16 if captured else 0)
+        if captured:
+            assert bool((mask[:, 8:24, 8:24] == 0).all()) and float(after.load_image()[:, 8:24, 8:24].max()) == 0.0
+        assert torch.allclose(after.load_image() * mask, before.load_image() * mask, atol=1e-6)
+    assert read_capture(tmp_path / "cut").points_path is not None
+
+
+@pytest.mark.parametrize("method", dict.fromkeys([*NEW_VIEWS, *MASKED]))
+@pytest.mark.parametrize("quick", [False, True])
+def test_nerfstudio_accepts_what_each_run_is_asked_for(method: str, quick: bool, tmp_path: Path):
+    config = Methods(quick=quick, iterations=90)
+    own = getattr(splats, method.replace("-", "_")).config
+    name, *arguments = arguments_of(method, tmp_path, 3, config)
+    dataparser = arguments.index("--data")  # ns-train's own option, which the bare config has too
+    assert name == method and arguments[dataparser + 1] == str(tmp_path / "capture")
+    parsed = tyro.cli(tyro.conf.FlagConversionOff[TrainerConfig], default=own, args=arguments)
+    completion, before = parsed.pipeline.datamanager.completion, own.pipeline.datamanager.completion
+    assert completion.seed == 3 and completion.at_step == min(before.at_step, 30) and completion.task == before.task
+    assert quick or (completion.anchor_views, completion.densify_rounds) == (before.anchor_views, before.densify_rounds)
+    assert parsed.max_num_iterations == 90 and parsed.experiment_name == "room"
+
+
+def measured(part: str, method: str, room: int, psnr: float, holes: float, consistency: float | None = None) -> dict:
+    row = {"part": part, "method": method, "room": room, "uncovered_psnr": psnr, "uncovered_hole_share": holes}
+    return row | ({"consistency_psnr": consistency} if part == "masked" else {})
+
+
+def test_means_and_bars():
+    rows = [measured("new views", "fillerbuster-none", room, 10.0 + room, 0.3) for room in (0, 1)]
+    rows += [measured("new views", "fillerbuster", room, 13.0 + room, 0.02) for room in (0, 1)]
+    rows += [measured("masked", "fillerbuster-none", 0, 10.0, 0.3, None), measured("masked", "nerfiller-grid", 0, 10.0, 0.3, 25.6)]
+    rows += [measured("masked", "fillerbuster-masked", 0, 10.0, 0.3, 29.6)]
+    means = means_of(rows)
+    assert means[0]["uncovered_psnr"] == 10.5 and means[0]["part"] == "new views, mean of 2 rooms" and means[0]["room"] == "all"
+    assert means[2]["consistency_psnr"] is None
+    values = {bar.name: (round(bar.value, 3), round(bar.limit, 3), bar.holds) for bar in bars_of(rows)}
+    assert values["PSNR gained on uncovered views (dB)"] == (3.0, 1.0, True)
+    assert values["hole share on uncovered views"] == (0.02, 0.1, True)
+    assert (29.6, 25.6, True) in values.values()
+    assert bars_of([]) == []
+
+
+def test_every_method_runs_on_every_room_and_a_second_benchmark_only_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With stand-ins for training and rendering."""
+    asked: list[tuple[str, str, int]] = []
+
+    def train(method, folder, room, config):
+        asked.append((folder.name, method, room))
+        methods_benchmark.run_folder(folder, method).mkdir(parents=True)
+        return {"seconds": 1.0, "generate_seconds": 0.5, "peak_gib": 1.0}
+
+    monkeypatch.setattr(methods_benchmark, "trained", train)
+    quality = {"uncovered_psnr": 12.0, "uncovered_hole_share": 0.1}
+    monkeypatch.setattr(methods_benchmark, "quality_of", lambda run, capture: dict(quality))
+    monkeypatch.setattr(methods_benchmark, "consistency_of", lambda run, plain, share: {"consistency_psnr": 20.0})
+    config = Methods(rooms=(0, 1), views=2, size=32, held_out=2, output=tmp_path / "out")
+    report = run_methods(config)
+    assert [(method, room) for name, method, room in asked if "masked" in name] == [(method, room) for room in (0, 1) for method in MASKED]
+    assert len(asked) == 2 * (len(NEW_VIEWS) + len(MASKED)) and len(report.rows) == len(asked) + len(NEW_VIEWS) + len(MASKED)
+    asked.clear()
+    again = run_methods(config)
+    assert asked == [] and again.rows == report.rows
+    written = json.loads(report.write(tmp_path / "report.json", command="fillerbuster bench methods").read_text())
+    assert written["rows"][0]["method"] == "fillerbuster-none"
+
+
+def test_a_block_of_everything_is_refused():
+    with pytest.raises(ValueError, match="block: expected a part"):
+        run_methods(Methods(block=1.0))
+
+
+@pytest.mark.slow
+def test_a_real_miniature(tmp_path: Path):
+    config = Methods(quick=True, new_views=("fillerbuster-cat3d-size",), masked=MASKED[1:], output=tmp_path / "out").miniature()
+    report = run_methods(config)
+    rows = {row["method"]: row for row in report.rows if row["room"] == 0}
+    assert rows["fillerbuster-cat3d-size"]["generated"] == 2 and rows["fillerbuster-masked"]["generated"] == 4
+    for method in MASKED[1:]:
+        assert rows[method]["consistency_psnr"] > 0 and rows[method]["block_psnr"] > 0 and rows[method]["peak_gib"] > 0.1
