@@ -159,7 +159,17 @@ class FillerbusterSplatModel(SplatfactoModel):
             param.grad = None
             param.data = param.data.new_zeros(count, *param.shape[1:])
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        state.setdefault("_extra_state", {"strategy": {}})  # checkpoints of earlier versions and of splatfacto have none
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The strategy's running sums, so that the next refinement after a resumption is the one that was due."""
+        return {"strategy": dict(self.strategy_state)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`get_extra_state` gave."""
+        for name, value in state["strategy"].items():
+            self.strategy_state[name] = value.to(self.device) if isinstance(value, Tensor) else value
 
     @torch.no_grad()
     def add_gaussians(self, points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], optimizers: Optimizers) -> int:

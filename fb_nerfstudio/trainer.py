@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
@@ -44,9 +46,15 @@ class FillerbusterTrainerConfig(TrainerConfig):
 
 
 class FillerbusterTrainer(Trainer):
-    """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on."""
+    """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on, on a CPU to the same bits."""
 
     config: FillerbusterTrainerConfig
+
+    def train_iteration(self, step: int) -> Any:
+        """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed run repeats them."""
+        seed = np.random.SeedSequence([self.config.machine.seed, step]).generate_state(1, np.uint64)[0]
+        torch.manual_seed(int(seed >> np.uint64(1)))
+        return super().train_iteration(step)
 
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio, but written beside the earlier checkpoints and then renamed; only then are the earlier ones removed."""

@@ -285,6 +285,19 @@ def test_the_saved_run_is_ours(chain: Chain):
     assert step == STEPS_AFTER_RESUME and len(pipeline.datamanager.generated_views) == ANCHORS + DENSIFIED
 
 
+@pytest.mark.parametrize("run", ["killed", "resumed"])
+@pytest.mark.parametrize("format", ["nerfstudio", "colmap"])
+def test_fillerbuster_export(chain: Chain, run: str, format: str, tmp_path: Path):
+    from method_configs.export_command import export_run
+
+    folder = export_run(getattr(chain, run), format=format, output=tmp_path / "completed")  # type: ignore[arg-type]
+    assert len(list((folder / "images").iterdir())) == VIEWS + HELD_OUT + ANCHORS + DENSIFIED
+    if format == "nerfstudio":
+        frames = validate_capture(folder, decode=True).frames
+        assert sum(frame.extra["generated"] for frame in frames) == ANCHORS + DENSIFIED
+        assert sum(frame.extra.get("held_out", False) for frame in frames) == HELD_OUT
+
+
 def test_a_sheet_of_the_run(chain: Chain, tmp_path: Path):
     from method_configs.sheet import write_sheet
 
