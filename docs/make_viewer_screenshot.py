@@ -1,6 +1,10 @@
 """Screenshot of nerfstudio's viewer with the generated frustums of a finished run, by a headless Chromium.
 
     python docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml
+    python docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml --complete 3 \\
+        --output docs/images/viewer_complete.png
+
+The second line lets the run train on, presses "Complete from here" as a person would, and shows what came of it.
 
 Needs the extra ``dev`` (playwright's Python package) and a Chromium of the system on PATH; nothing is downloaded.
 """
@@ -12,12 +16,14 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import tyro
+import yaml
 from playwright.sync_api import Page, sync_playwright
 
 BROWSERS = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
@@ -34,6 +40,8 @@ def main(
     zoom_out: int = 3,
     settle_seconds: float = 25.0,
     start_seconds: float = 240.0,
+    complete: int = 0,
+    complete_seconds: float = 900.0,
 ) -> None:
     """Start ns-viewer on a run, look at it from outside, and save what a browser shows.
 
@@ -44,17 +52,24 @@ def main(
         zoom_out: turns of the mouse wheel; the camera starts among the frustums.
         settle_seconds: time for the splats to be rendered and the pictures of the frustums to arrive.
         start_seconds: longest wait for the viewer to answer.
+        complete: go on with the training, and ask for so many views from where the camera starts.
+        complete_seconds: longest wait for these.
     """
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         sys.exit(f"no browser found on PATH (one of {', '.join(BROWSERS)}); install the system package chromium")
     output.parent.mkdir(parents=True, exist_ok=True)
     port = _free_port()
-    with _viewer(load_config, port, start_seconds), sync_playwright() as playwright:
+    with tempfile.TemporaryDirectory() as unwanted, sync_playwright() as playwright, ExitStack() as running:
+        command = _training(load_config, Path(unwanted)) if complete else _looking(load_config)
+        running.enter_context(_viewer(command, port, start_seconds))
         chromium = playwright.chromium.launch(executable_path=browser, args=FLAGS)
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
+        page.set_default_timeout(300_000)  # frustums in software take their time on a busy machine
         page.goto(f"http://127.0.0.1:{port}", wait_until="load", timeout=120_000)
         page.add_style_tag(content="img[alt='NerfStudio Logo'] { visibility: hidden; }")  # comes from the internet
+        if complete:
+            _complete(page, complete, complete_seconds)
         _step_back(page, size, zoom_out)
         page.wait_for_timeout(1000 * settle_seconds)
         page.screenshot(path=output, timeout=120_000)
@@ -72,10 +87,32 @@ def _step_back(page: Page, size: tuple[int, int], turns: int) -> None:
         page.wait_for_timeout(150)
 
 
+def _complete(page: Page, views: int, seconds: float) -> None:
+    """Ask for a fan of views and wait until it is there."""
+    page.wait_for_selector("canvas", timeout=120_000)
+    page.wait_for_timeout(8000)  # the first render decides where the camera stands
+    page.locator("xpath=//*[normalize-space(text())='Views']/following::input[1]").fill(str(views))
+    page.keyboard.press("Tab")
+    page.get_by_role("button", name="Complete from here").click()
+    page.get_by_text("Gaussians placed in holes").wait_for(timeout=1000 * seconds)
+
+
+def _looking(config: Path) -> list[Path | str]:
+    """The command that shows a run."""
+    return [Path(sys.executable).with_name("ns-viewer"), "--load-config", config]
+
+
+def _training(config: Path, output: Path) -> list[Path | str]:
+    """The command that goes on with a run, into another folder."""
+    told = yaml.load(config.read_text(), Loader=yaml.Loader)
+    checkpoints = config.parent / "nerfstudio_models"
+    command = [Path(sys.executable).with_name("ns-train"), told.method_name, "--data", told.data, "--load-dir", checkpoints]
+    return [*command, "--output-dir", output, "--vis", "viewer", "--max-num-iterations", "1000000"]
+
+
 @contextmanager
-def _viewer(config: Path, port: int, start_seconds: float) -> Iterator[None]:
-    """A running ns-viewer on 127.0.0.1 that answers."""
-    command = [Path(sys.executable).with_name("ns-viewer"), "--load-config", config]
+def _viewer(command: list[Path | str], port: int, start_seconds: float) -> Iterator[None]:
+    """A running ns-viewer or ns-train on 127.0.0.1 that answers."""
     options = ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(port)]
     options += ["--viewer.default-composite-depth", "False"]  # or splats in front would hide the frustums
     process = subprocess.Popen([*map(str, command), *options], stdin=subprocess.DEVNULL)
@@ -83,7 +120,7 @@ def _viewer(config: Path, port: int, start_seconds: float) -> Iterator[None]:
         until = time.monotonic() + start_seconds
         while not _answers(port):
             if process.poll() is not None or time.monotonic() > until:
-                sys.exit(f"ns-viewer did not start within {start_seconds:.0f} seconds; its output above says why")
+                sys.exit(f"the viewer did not start within {start_seconds:.0f} seconds; its output above says why")
             time.sleep(0.5)
         yield
     finally:
