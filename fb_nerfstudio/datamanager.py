@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import logging
 import random
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +18,6 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
@@ -29,8 +25,9 @@ from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pin
 from fb_nerfstudio.completed_views import REQUESTED, CompletedViews, round_title
 from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
-from fb_nerfstudio.completion_plan import PlannedRound, plan_completion
+from fb_nerfstudio.completion_plan import plan_completion
 from fb_nerfstudio.dataparser import without_open3d
+from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
@@ -199,13 +196,13 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         completion = self.config.completion
         if not completion.enabled or self._finished or step < completion.at_step:
             return
-        with _own_randomness(self.device):
+        with own_randomness(self.device):
             self._complete(attributes, step)
 
     def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
         started = time.perf_counter()
-        config, splats, trainer = self.config.completion, _splats_of(attributes), attributes.trainer
+        config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
         model, cameras = self._load_inpainter(), self._captured_cameras()
         points = self._seen_points(splats, cameras, step)
         inpaints = config.task == "inpaint"
@@ -215,16 +212,16 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if plan.rounds:
             told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
             CONSOLE.print(told)
-            context = _LazyViews(lambda index: self._captured_view(index, cameras[index]), plan.context)
+            context = LazyViews(lambda index: self._captured_view(index, cameras[index]), plan.context)
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))
-            with _Bars(self.completion_panel, len(plan.rounds)) as bars, _refusing():
-                for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=_say_found):
+            with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
+                for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
                     left -= 1
                     self._set_bank(merged(self._bank, (), views))
                     if left > 0:
-                        _save_checkpoint(trainer, step)
+                        save_checkpoint(trainer, step)
         del model
-        _release_memory()
+        release_memory()
         done, requested = _without_requested(self._bank)
         if done is not None:
             done, added = self._seed_unseen(done, attributes, plan.shell, cameras, step)
@@ -234,7 +231,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             seconds = time.perf_counter() - started
             CONSOLE.print(f"{len(done)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
         self._finished = True
-        _save_checkpoint(trainer, step)
+        save_checkpoint(trainer, step)
 
     def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Do what was asked for in the viewer, one request before each iteration. What cannot be done is said there; training goes on."""
@@ -242,12 +239,12 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if request is None:
             return
         try:
-            with _own_randomness(self.device):
+            with own_randomness(self.device):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
             _logger.debug("request %s", request, exc_info=True)
-        _release_memory()
+        release_memory()
         CONSOLE.print(said)
         self.completion_panel.report(said)
 
@@ -259,23 +256,23 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         else:
             said = self._generate_requested(request, attributes, step)
         self._save_bank(attributes.trainer)
-        _save_checkpoint(attributes.trainer, step)
+        save_checkpoint(attributes.trainer, step)
         return said
 
     def _generate_requested(self, request: CompleteFrom | RegenerateRound, attributes: TrainingCallbackAttributes, step: int) -> str:
         """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
         started = time.perf_counter()
-        config, splats = self.config.completion, _splats_of(attributes)
+        config, splats = self.config.completion, splats_of(attributes)
         model, cameras = self._load_inpainter(), self._captured_cameras()
         points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
         survey = dataclasses.replace(config, anchor_views=0, densify_rounds=0, camera_path=None)
         scene = plan_completion(cameras, points, survey, size=config.image_size or model.size)
         planned = plan_request(request, scene, self._bank, cameras, config)
         context = [self._captured_view(index, cameras[index]) for index in planned.plan.context]
-        with _Bars(self.completion_panel, 1) as bars:
-            (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=_say_found)
+        with Bars(self.completion_panel, 1) as bars:
+            (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found)
         del model
-        _release_memory()
+        release_memory()
         new, added = self._seed_unseen(new, attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self._bank, planned.replaces, new))
         title = round_title(new.origins[0].role, new.origins[0].round)
@@ -324,7 +321,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
         Returns the views as they are to be trained on, and the number of new Gaussians.
         """
-        config, splats = self.config.completion, _splats_of(attributes)
+        config, splats = self.config.completion, splats_of(attributes)
         if config.task == "inpaint":  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
             return views, 0
         seeds = config.seed_gaussians and hasattr(splats, "add_gaussians")
@@ -380,11 +377,6 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
 
 
-def _say_found(planned: PlannedRound) -> None:
-    title = round_title(planned.role, planned.number)
-    CONSOLE.print(f"{title}: {len(planned.cameras)} views found in the cache, nothing is generated for them.")
-
-
 def _without_requested(bank: CompletedViews | None) -> tuple[CompletedViews | None, CompletedViews | None]:
     """The automatic views of a bank, and those that were asked for in the viewer; None where there are none."""
     if bank is None:
@@ -394,76 +386,3 @@ def _without_requested(bank: CompletedViews | None) -> tuple[CompletedViews | No
         return bank, None
     other = [index for index in range(len(bank)) if index not in set(asked)]
     return (bank[other] if other else None), bank[asked]
-
-
-def _release_memory() -> None:
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
-
-
-@contextmanager
-def _refusing() -> Iterator[None]:
-    """A sentence instead of a traceback for what the model refuses, such as too small a memory budget."""
-    try:
-        yield
-    except ValueError as error:
-        raise Refused(str(error)) from None
-
-
-def _splats_of(attributes: TrainingCallbackAttributes) -> Any:
-    """The splat model that is being trained."""
-    assert attributes.pipeline is not None  # nerfstudio's trainer always gives it
-    return attributes.pipeline.model
-
-
-class _LazyViews(Sequence[CapturedView]):
-    """Captured views in order, each read when it is looked at: whole photos as floats would fill the memory."""
-
-    def __init__(self, load: Callable[[int], CapturedView], indices: Sequence[int]):
-        self._load, self._indices = load, indices
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def __getitem__(self, place: Any) -> Any:
-        return [self._load(index) for index in self._indices[place]] if isinstance(place, slice) else self._load(self._indices[place])
-
-
-class _Bars:
-    """Progress of the rounds on the terminal (nothing when it is not one) and in the viewer."""
-
-    def __init__(self, panel: CompletionPanel, rounds: int):
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        self._progress = Progress(*columns, console=CONSOLE, transient=True, disable=not CONSOLE.is_terminal)
-        self._panel, self._rounds, self._tasks = panel, rounds, {}
-
-    def __enter__(self) -> _Bars:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-        self._panel.report("")
-
-    def step(self, planned: PlannedRound, done: int, steps: int) -> None:
-        """Called by the sampler after each denoising step."""
-        title = f"{round_title(planned.role, planned.number)}: {len(planned.cameras)} views"
-        if planned.number not in self._tasks:
-            self._tasks[planned.number] = self._progress.add_task(title, total=steps)
-        self._progress.update(self._tasks[planned.number], completed=done)
-        self._panel.report(f"Generating, {title}, step {done} of {steps}", share=done / steps)
-
-
-@contextmanager
-def _own_randomness(device: torch.device | str) -> Iterator[None]:
-    """Leaves torch's global random state as it was: training goes on as if nothing had been generated."""
-    device = torch.device(device)
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        yield
-
-
-def _save_checkpoint(trainer: Any, step: int) -> None:
-    """A checkpoint of the state before this step; a resumed run begins with it (with step 1 where there is none before)."""
-    if trainer is not None:
-        trainer.save_checkpoint(max(step - 1, 0))
