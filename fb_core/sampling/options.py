@@ -29,9 +29,9 @@ class SamplingConfig:
     """Guidance scale of a prompt; without a prompt, or at 0, text costs nothing."""
     guidance: GuidanceVariant = field(default_factory=GuidanceVariant)
     """Changes to the paper's guidance."""
-    solver: str = "ab2"
+    solver: str = "corrected"
     """'euler', 'heun' (two evaluations a step), 'ab2' (second-order Adams-Bashforth: Euler's error in a third of the steps) or
-    'corrected' (AB2 with a bounded correction, for few steps)."""
+    'corrected' (AB2 with a bounded correction at no further evaluation; docs/speed_and_accuracy.md)."""
     grid: str = "even"
     """'even', or the original's 'reference', whose last step is worth nothing."""
     shift: float = 2.0
