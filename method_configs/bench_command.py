@@ -53,7 +53,8 @@ class Networks:
             config = config if self.full_size else dataclasses.replace(config, full_size=None)
         config = dataclasses.replace(config, seed=self.seed)
         report = benchmark.run_networks(config, on_cell=_say)
-        show(report, self.json, [] if self.figure is None else [lambda: _draw_networks(report, self.figure)])
+        figure = self.figure
+        show(report, self.json, [] if figure is None else [lambda: _draw_networks(report, figure)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +82,8 @@ class Precision:
         config = dataclasses.replace(benchmark.QUICK if self.quick else benchmark.PrecisionBenchmark(), seed=self.seed)
         model = None if self.model is None else Fillerbuster.from_pretrained(self.model)
         report = benchmark.run_precision(config, model, on_cell=_say)
-        show(report, self.json, [] if self.figure is None else [lambda: _draw_precision(report, self.figure)])
+        figure = self.figure
+        show(report, self.json, [] if figure is None else [lambda: _draw_precision(report, figure)])
 
 
 def show(report: Report, json: Path | None, drawings: list) -> None:

@@ -80,7 +80,7 @@ class _Cell:
         )
 
     def encode(self) -> tuple[Conditioning, Conditioning]:
-        vaes = {"image_vae": self.model.image_vae, "raymap_vae": self.model.raymap_vae}
+        vaes: dict[str, Any] = {"image_vae": self.model.image_vae, "raymap_vae": self.model.raymap_vae}
         known = encode_known(self.images, self.image_known, self.raymaps01, self.rays_known, **vaes)
         height, width = self.images.shape[-2:]
         return encode_null(known, **vaes, pixels=(height, width)), known
