@@ -180,11 +180,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if self.config.completion.enabled and not self._finished:
             self._check_inpainter()
         self.completion_panel.training_begins(takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views")
-        before, after, given = (
-            TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
-            TrainingCallbackLocation.AFTER_TRAIN,
-            training_callback_attributes,
-        )
+        given = training_callback_attributes
+        before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
         return [
             *super().get_training_callbacks(given),
             TrainingCallback([before], self._complete_when_due, args=[given]),

@@ -90,7 +90,7 @@ class FillerbusterSplatModel(SplatfactoModel):
     config: FillerbusterSplatModelConfig
 
     def populate_modules(self) -> None:
-        """Everything that splatfacto sets up, without its `.cuda()` and without LPIPS as a submodule (a download at start)."""
+        """Everything that splatfacto sets up, without its move to CUDA and without LPIPS as a submodule (a download at start)."""
         config = self.config
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(values) for name, values in self._initial_gaussians().items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")

@@ -17,9 +17,10 @@ from fb_core.data.media import read_image, resize
 from fb_core.data.undistort import check_lens, straight_directions
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import CaptureShape
-from fb_core.geometry.shell import fit_shell, intersect
+from fb_core.geometry.shell import intersect
 from fb_core.geometry.triangulation import Features, detect, triangulate
-from fb_nerfstudio.bridge import flip_axes
+from fb_nerfstudio.bridge import to_pinholes
+from fb_nerfstudio.completion_plan import shell_of
 
 _SIDE = 960  # pixels of the longer side in which features are sought
 _MODELS = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: "OPENCV_FISHEYE"}
@@ -66,13 +67,7 @@ class _Photo:
         if outputs.mask_filenames is not None:
             mask = read_image(outputs.mask_filenames[index], apply_orientation=False)[:1]
             known = (resize(mask, height, width) > 0.999).float()
-        camera = Pinholes(
-            camera_to_world=flip_axes(cameras.camera_to_worlds[index : index + 1].float()),
-            focal=torch.stack([cameras.fx[index], cameras.fy[index]], dim=-1).float(),
-            principal=torch.stack([cameras.cx[index], cameras.cy[index]], dim=-1).float(),
-            width=int(cameras.width[index]),
-            height=int(cameras.height[index]),
-        ).scaled(width, height)
+        camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)
         return cls(resize(image, height, width).clamp(0, 1), known, camera, *lens)
 
     def world_directions(self, places: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
@@ -99,9 +94,7 @@ def _lens(cameras: Cameras, index: int) -> tuple[str, dict[str, float]] | None:
 
 def _filling(photos: list[_Photo], points: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Random pixels of all photos, moved out to the shell."""
-    shape = CaptureShape.of([photo.camera for photo in photos])
-    guess = (3.0 if shape.outward else 2.0) * shape.radius
-    shell = fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up)
+    shell = shell_of(CaptureShape.of([photo.camera for photo in photos]), points)
     draws = torch.rand(count, 3, generator=generator)
     chosen = (draws[:, 0] * len(photos)).long().clamp(max=len(photos) - 1)
     positions, colors = [], []

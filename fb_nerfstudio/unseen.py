@@ -45,6 +45,11 @@ class Rendered:
     rgb: Float[Tensor, "n 3 h w"]
     """Colours in [0, 1], over the model's background where the splats are not opaque."""
 
+    @property
+    def solid(self) -> Bool[Tensor, "n h w"]:
+        """True where splats cover the pixel at a depth that means something."""
+        return (self.accumulation >= SOLID) & torch.isfinite(self.depth) & (self.depth > 0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Unseen:
@@ -84,8 +89,7 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
     for camera in cameras:
         small = coarse(camera)
         rendered = render_geometry(model, small)
-        solid = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
-        groups.append(small.unproject(rendered.depth)[solid])
+        groups.append(small.unproject(rendered.depth)[rendered.solid])
     points = torch.cat(groups) if groups else torch.empty(0, 3)
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit)).long()]
 
@@ -110,7 +114,7 @@ def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shel
     points = origins + distance[..., None] * directions
     surface, covered = points, torch.ones_like(distance, dtype=torch.bool)
     if rendered is not None:
-        covered = (rendered.accumulation >= SOLID) & torch.isfinite(rendered.depth) & (rendered.depth > 0)
+        covered = rendered.solid
         surface = torch.where(covered[..., None], cameras.unproject(rendered.depth), points)
     flat = surface.reshape(-1, 3)
     finite = torch.nan_to_num(flat, posinf=1e9, neginf=-1e9)
@@ -134,14 +138,19 @@ def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendere
     size = images.shape[2:]
     reliable = ~unseen.mask & (rendered.accumulation >= _OPAQUE)
     colors = F.interpolate(rendered.rgb, size=size, mode="bilinear", align_corners=False)
-    matched = without_seams(images, colors, F.interpolate(reliable[:, None].float(), size=size, mode="nearest")[:, 0] > 0)
+    matched = without_seams(images, colors, _at_size(reliable, size)[:, 0])
     return dataclasses.replace(views, images=rearrange((matched * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous())
 
 
 def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
     """The views with masks that leave only unseen pixels of what they left. No seam: generated pixels would blur captured ones."""
-    masks = F.interpolate(unseen.mask[:, None].float(), size=views.images.shape[1:3], mode="nearest") > 0
+    masks = _at_size(unseen.mask, views.images.shape[1:3])
     return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1") & views.masks)
+
+
+def _at_size(mask: Bool[Tensor, "n h w"], size: Sequence[int]) -> Bool[Tensor, "n 1 height width"]:
+    """A coarse mask at the size (height, width) of the pictures, without blur."""
+    return F.interpolate(mask[:, None].float(), size=tuple(size), mode="nearest") > 0
 
 
 def unseen_gaussians(
