@@ -4,24 +4,72 @@ import pytest
 import torch
 from tiny_models import tiny_model
 
-from fb_core.evaluation.completion import CompletionTask, evaluate_completion, mean_color, nearest_known, summary, unseen_room
+from fb_core.evaluation.completion import (
+    METHODS,
+    CompletionTask,
+    baselines,
+    evaluate_completion,
+    mean_color,
+    nearest_known,
+    summary,
+    unseen_room,
+)
+from fb_core.evaluation.reprojection import inpainted, reproject
 from fb_core.inpainter import SamplingConfig
 
 TASK = CompletionTask(rooms=2, views=4, known=2)
 QUICK = SamplingConfig(steps=2)
+ROOM = unseen_room(family="narrow", seed=0, number=0, views=4, size=16)
 
 
 def test_nearest_known_view_of_a_known_camera_is_its_picture():
-    images, cameras = unseen_room(TASK, 0, 16)
-    assert torch.equal(nearest_known(images, cameras, cameras), images)
+    assert torch.equal(nearest_known(ROOM.images, ROOM.cameras, ROOM.cameras), ROOM.images)
 
 
 def test_mean_colour_is_the_best_constant_picture():
-    images, _ = unseen_room(TASK, 0, 16)
-    constant = mean_color(images, 4)
-    assert constant.shape == images.shape
-    best = (constant - images).square().mean()
-    assert all((constant + shift - images).square().mean() > best for shift in (-0.05, 0.05))
+    constant = mean_color(ROOM.images, 4)
+    assert constant.shape == ROOM.images.shape
+    best = (constant - ROOM.images).square().mean()
+    assert all((constant + shift - ROOM.images).square().mean() > best for shift in (-0.05, 0.05))
+
+
+def test_reprojection_into_the_same_camera_is_the_picture():
+    one = ROOM[:1]
+    drawn, known = reproject(one.images, one.depth, one.cameras, one.cameras)
+    assert bool(known.all()) and torch.allclose(drawn, one.images, atol=1e-6)
+
+
+def test_reprojection_by_true_depth_finds_the_pixels_that_two_cameras_share():
+    room = unseen_room(family="narrow", seed=0, number=1, views=12, size=64)
+    drawn, known = reproject(room[:8].images, room[:8].depth, room[:8].cameras, room[8:].cameras)
+    error = (drawn - room.images[8:]).abs().mean(dim=1)[known]
+    assert 0.2 < float(known.float().mean()) < 1 and float(error.median()) < 0.03
+
+
+def test_the_nearer_of_two_surfaces_hides_the_other():
+    two = ROOM[:1].cameras[[0, 0]]
+    images = torch.stack([torch.full((3, 16, 16), 0.2), torch.full((3, 16, 16), 0.9)])
+    drawn, _ = reproject(images, torch.stack([torch.full((16, 16), 3.0), torch.full((16, 16), 2.0)]), two, ROOM[:1].cameras)
+    assert torch.allclose(drawn, torch.full_like(drawn, 0.9))
+
+
+def test_what_lies_behind_a_camera_is_not_drawn_and_nothing_known_is_grey():
+    _, known = reproject(ROOM.images[:1], -ROOM.depth[:1], ROOM.cameras[[0]], ROOM.cameras[[0]])
+    assert not bool(known.any())
+    assert torch.equal(inpainted(ROOM.images[:1], known), torch.full_like(ROOM.images[:1], 0.5))
+
+
+def test_inpainting_keeps_what_is_known_and_continues_a_constant():
+    known = torch.ones(1, 16, 16, dtype=torch.bool)
+    known[:, 5:9, 5:9] = False
+    filled = inpainted(torch.full((1, 3, 16, 16), 0.25), known)
+    assert torch.allclose(filled, torch.full_like(filled, 0.25), atol=1 / 255)
+
+
+def test_baselines_answer_for_every_hidden_view():
+    answers = baselines(ROOM[:3], ROOM[3:].cameras)
+    assert set(answers) == set(METHODS) - {"model"}
+    assert all(answer.shape == (1, 3, 16, 16) and bool(torch.isfinite(answer).all()) for answer in answers.values())
 
 
 def test_evaluation_is_reproducible_and_leaves_known_views_alone(tmp_path):
@@ -29,7 +77,7 @@ def test_evaluation_is_reproducible_and_leaves_known_views_alone(tmp_path):
     first, again = (list(evaluate_completion(model, TASK, QUICK)) for _ in range(2))
     assert [r.psnr for r in first] == [r.psnr for r in again]
     for result in first:
-        assert torch.equal(result.completed[:2], result.truth[:2]) and set(result.psnr) == {"model", "nearest", "mean"}
+        assert torch.equal(result.completed[:2], result.truth[:2]) and set(result.psnr) == set(METHODS)
     table = summary(first)
     assert table["mean"]["psnr"] == pytest.approx(sum(r.psnr["mean"] for r in first) / 2)
 

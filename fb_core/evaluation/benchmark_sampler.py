@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fb_core.evaluation.benchmarks import Bar, OnCell, Report
-from fb_core.evaluation.completion import CompletionTask, unseen_room
+from fb_core.evaluation.completion import unseen_room
 from fb_core.evaluation.solvable_flows import Mixture, fine_endpoint, guided_flow
 from fb_core.inpainter import Fillerbuster
 from fb_core.sampling.guidance import GuidanceVariant
@@ -145,8 +145,8 @@ def _trained(config: SamplerBenchmark, model: Fillerbuster, guidance: float, num
 
 
 def _room(config: SamplerBenchmark, number: int) -> Views:
-    images, cameras = unseen_room(CompletionTask(views=config.views, known=1, seed=config.seed), number, config.size)
-    views = Views.known(images, cameras)
+    room = unseen_room(family="narrow", seed=config.seed, number=number, views=config.views, size=config.size)
+    views = Views.known(room.images, room.cameras)
     return dataclasses.replace(views, image_known=views.image_known.clone(), rays_known=views.rays_known.clone())
 
 

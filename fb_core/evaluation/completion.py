@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -14,11 +13,13 @@ from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, make_room
 from fb_core.evaluation.image_metrics import psnr
+from fb_core.evaluation.reprojection import inpainted, reproject
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.views import Views
 
-METHODS = ("model", "nearest", "mean")
+METHODS = ("model", "nearest", "mean", "reprojected", "reprojected by true depth")
+_FAR = 1e4  # metres; so far away that only the camera's rotation counts
 _FIRST_UNSEEN_ROOM = 10**12  # seeds that no training reaches
 
 
@@ -56,12 +57,27 @@ class RoomResult:
     """Mean PSNR in dB over the unknown views, per method of `METHODS`."""
 
 
-def unseen_room(task: CompletionTask, number: int, size: int) -> tuple[Float[Tensor, "n 3 h w"], Pinholes]:
-    """Pictures and cameras of a room outside every training."""
-    seed = _FIRST_UNSEEN_ROOM + 1000 * task.seed + number
-    room = make_room(seed, FAMILIES[task.family])
-    cameras = training_cameras(room, task.views, size=size, generator=torch.Generator().manual_seed(seed))
-    return render(room, cameras, supersample=2).rgb.clamp(0, 1), cameras
+@dataclass(frozen=True, kw_only=True)
+class RoomViews:
+    """Views of one room with its ground truth."""
+
+    images: Float[Tensor, "n 3 h w"]
+    cameras: Pinholes
+    depth: Float[Tensor, "n h w"]
+    """z-depth in metres."""
+
+    def __getitem__(self, part: slice) -> RoomViews:
+        places = list(range(*part.indices(len(self.images))))
+        return RoomViews(images=self.images[part], cameras=self.cameras[places], depth=self.depth[part])
+
+
+def unseen_room(*, family: str, seed: int, number: int, views: int, size: int) -> RoomViews:
+    """A room outside every training, seen by cameras as in training."""
+    draw = _FIRST_UNSEEN_ROOM + 1000 * seed + number
+    room = make_room(draw, FAMILIES[family])
+    cameras = training_cameras(room, views, size=size, generator=torch.Generator().manual_seed(draw))
+    rendered = render(room, cameras, supersample=2)
+    return RoomViews(images=rendered.rgb.clamp(0, 1), cameras=cameras, depth=rendered.depth)
 
 
 def nearest_known(images: Float[Tensor, "k 3 h w"], known: Pinholes, unknown: Pinholes) -> Float[Tensor, "m 3 h w"]:
@@ -75,6 +91,23 @@ def mean_color(images: Float[Tensor, "k 3 h w"], count: int) -> Float[Tensor, "m
     return images.mean(dim=(0, 2, 3))[None, :, None, None].expand(count, -1, *images.shape[2:])
 
 
+def baselines(given: RoomViews, hidden: Pinholes) -> dict[str, Float[Tensor, "m 3 h w"]]:
+    """What one has without a model. The one by true depth knows what nobody has at hand: a bound, not a competitor."""
+    answers = {"nearest": nearest_known(given.images, given.cameras, hidden), "mean": mean_color(given.images, len(hidden))}
+    for name, depth in (("reprojected", torch.full_like(given.depth, _FAR)), ("reprojected by true depth", given.depth)):
+        answers[name] = inpainted(*reproject(given.images, depth, given.cameras, hidden))
+    return answers
+
+
+def complete_hidden(
+    model: Fillerbuster, given: RoomViews, hidden: RoomViews, sampling: SamplingConfig, *, seed: int
+) -> Float[Tensor, "m 3 h w"]:
+    """The hidden views as the model generates them in one sequence with the given ones."""
+    views = Views.cat([Views.known(given.images, given.cameras), Views.unknown(hidden.cameras)])
+    completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling)
+    return completed.images[len(given.images) :]
+
+
 def evaluate_completion(
     model: Fillerbuster,
     task: CompletionTask,
@@ -84,19 +117,12 @@ def evaluate_completion(
 ) -> Iterable[RoomResult]:
     """Complete one unseen room after the other; yields each result."""
     for number in range(task.rooms):
-        images, cameras = unseen_room(task, number, model.size)
-        mask = torch.zeros_like(images[:, :1])
-        mask[: task.known] = 1
-        views = dataclasses.replace(Views.known(images, cameras), image_known=mask)
-        completed = model.complete(views, generator=torch.Generator().manual_seed(task.seed + number), sampling=sampling).images
-        given, hidden = images[: task.known], images[task.known :]
-        answers = {
-            "model": completed[task.known :],
-            "nearest": nearest_known(given, cameras[list(range(task.known))], cameras[list(range(task.known, task.views))]),
-            "mean": mean_color(given, len(hidden)),
-        }
-        errors = {name: float(psnr(answer, hidden).mean()) for name, answer in answers.items()}
-        yield RoomResult(truth=images, completed=completed, psnr=errors)
+        room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)
+        given, hidden = room[: task.known], room[task.known :]
+        completed = complete_hidden(model, given, hidden, sampling, seed=task.seed + number)
+        answers = baselines(given, hidden.cameras) | {"model": completed}
+        errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in METHODS}
+        yield RoomResult(truth=room.images, completed=torch.cat([given.images, completed]), psnr=errors)
         if on_room is not None:
             on_room(number + 1, task.rooms)
 
