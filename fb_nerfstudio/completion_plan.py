@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import (
     CaptureShape,
@@ -29,7 +30,6 @@ from fb_core.geometry.paths import (
     strided_subset,
 )
 from fb_core.geometry.shell import Shell, fit_shell
-from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completed_views import ANCHOR, DENSIFY
 from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
 from fb_nerfstudio.context_views import nearest_context

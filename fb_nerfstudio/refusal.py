@@ -9,9 +9,9 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from fb_core import checkpoint
+from fb_core.data.camera_path import read_camera_path
 from fb_core.data.captures import Capture, Frame, validate_capture
 from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
-from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.grid_inpainter import check_weights
 

@@ -17,8 +17,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completed_views import DENSIFY, REQUESTED, CompletedViews
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, PlannedRound, lens_of

@@ -12,9 +12,9 @@ import torch
 from nerfstudio.cameras.camera_paths import get_path_from_json
 from test_completion import UP, MeanFiller, box_points, captured, room_cameras, small
 
+from fb_core.data.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.bridge import flip_axes, to_pinholes
-from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completion import announcement, run_completion
 from fb_nerfstudio.completion_plan import plan_completion
 
@@ -105,7 +105,7 @@ def test_another_tools_file_is_one_sentence(tmp_path: Path, kind: str):
     (tmp_path / "path.json").write_text(text)
     with pytest.raises(ValueError, match=sentence) as told:
         read_camera_path(tmp_path / "path.json", size=16)
-    assert "\n" not in str(told.value) and "completion.camera_path" in str(told.value)
+    assert "\n" not in str(told.value) and "camera path" in str(told.value)
 
 
 def test_other_lenses_poses_and_fields_of_view_are_refused(tmp_path: Path):

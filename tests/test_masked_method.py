@@ -9,8 +9,8 @@ import torch
 from test_camera_path import write_path
 from test_datamanager import GreyFiller, attributes, draws, generated, make, options, run_callbacks, stand_in_model  # noqa: F401
 
+from fb_core.data.camera_path import read_camera_path
 from fb_core.data.captures import validate_capture
-from fb_nerfstudio.camera_path import read_camera_path
 from fb_nerfstudio.completed_views import INPAINTED
 from fb_nerfstudio.completion_config import CompletionConfig, MaskedConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManager, Refused

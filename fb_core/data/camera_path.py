@@ -21,7 +21,7 @@ class CameraPath:
     """The path's cameras as square pictures in which the path's own pictures stand centred, their long side filling the square's."""
 
     cameras: Pinholes
-    """OpenCV axes, in the world of the splats, exactly where the path puts them."""
+    """OpenCV axes, in the world of the file (that of the splats where it was drawn beside them), exactly where the path puts them."""
     aspect: float
     """Width over height of the path's pictures."""
 
@@ -29,7 +29,7 @@ class CameraPath:
 def read_camera_path(path: Path, *, size: int) -> CameraPath:
     """Read a camera path that was saved in nerfstudio's viewer.
 
-    Its poses are camera-to-world with OpenGL axes in the world of the splats; ``fov`` is the vertical field of view in degrees of
+    Its poses are camera-to-world with OpenGL axes; ``fov`` is the vertical field of view in degrees of
     a picture of ``render_width`` by ``render_height``.
 
     Args:
@@ -43,10 +43,10 @@ def read_camera_path(path: Path, *, size: int) -> CameraPath:
     width, height = (_positive(content, key, path) for key in ("render_width", "render_height"))
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
-        raise ValueError(f"completion.camera_path {path}: expected camera_type perspective, got {kind!r}; save a perspective path")
+        raise ValueError(f"camera path {path}: expected camera_type perspective, got {kind!r}; save a perspective path")
     entries = content["camera_path"]
     if not isinstance(entries, list) or not entries:
-        raise ValueError(f"completion.camera_path {path}: it has no cameras; add keyframes in the viewer's Render tab and save it again")
+        raise ValueError(f"camera path {path}: it has no cameras; add keyframes in the viewer's Render tab and save it again")
     poses = torch.stack([_pose(entry, index, path) for index, entry in enumerate(entries)])
     degrees = torch.tensor([_field_of_view(entry, index, path) for index, entry in enumerate(entries)], dtype=torch.float64)
     focal = 0.5 * height / torch.tan(torch.deg2rad(degrees) / 2) * size / max(width, height)
@@ -62,16 +62,16 @@ def read_camera_path(path: Path, *, size: int) -> CameraPath:
 
 def _load(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise ValueError(f"completion.camera_path {path}: no such file; save a path in the viewer's Render tab, or check the name")
+        raise ValueError(f"camera path {path}: no such file; save a path in the viewer's Render tab, or check the name")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError):
-        raise ValueError(f"completion.camera_path {path}: not a JSON file; save a path in the viewer's Render tab") from None
+        raise ValueError(f"camera path {path}: not a JSON file; save a path in the viewer's Render tab") from None
     needed = ("camera_path", "render_width", "render_height")
     if not isinstance(content, dict) or any(key not in content for key in needed):
         got = f"the keys {', '.join(sorted(map(str, content))[:6]) or 'none'}" if isinstance(content, dict) else type(content).__name__
         raise ValueError(
-            f"completion.camera_path {path}: expected a path of nerfstudio's viewer with {', '.join(needed)}, got {got}; "
+            f"camera path {path}: expected a path of nerfstudio's viewer with {', '.join(needed)}, got {got}; "
             "it is another tool's, so draw the path in the viewer's Render tab and save it there"
         )
     return content
@@ -80,13 +80,13 @@ def _load(path: Path) -> dict[str, Any]:
 def _positive(content: dict[str, Any], key: str, path: Path) -> float:
     value = content[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value < 1e6:
-        raise ValueError(f"completion.camera_path {path}: expected a number of pixels for {key}, got {value!r}; save the path again")
+        raise ValueError(f"camera path {path}: expected a number of pixels for {key}, got {value!r}; save the path again")
     return float(value)
 
 
 def _pose(entry: Any, index: int, path: Path) -> torch.Tensor:
     """Camera-to-world [3, 4] in float64, OpenGL axes."""
-    where = f"completion.camera_path {path}: camera {index}"
+    where = f"camera path {path}: camera {index}"
     values = entry.get("camera_to_world") if isinstance(entry, dict) else None
     if isinstance(values, list) and len(values) == 4:
         values = [value for row in values for value in (row if isinstance(row, list) else [row])]
@@ -105,7 +105,7 @@ def _field_of_view(entry: dict[str, Any], index: int, path: Path) -> float:
     value = entry.get("fov")
     if isinstance(value, bool) or not isinstance(value, int | float) or not _LEAST_DEGREES <= value <= _MOST_DEGREES:
         raise ValueError(
-            f"completion.camera_path {path}: camera {index} has a field of view (fov) of {value!r}, expected "
+            f"camera path {path}: camera {index} has a field of view (fov) of {value!r}, expected "
             f"{_LEAST_DEGREES:g} to {_MOST_DEGREES:g} degrees"
         )
     return float(value)
