@@ -18,7 +18,7 @@ from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor
 
-_HEIF_SUFFIXES = (".heic", ".heif")
+HEIF_SUFFIXES = (".heic", ".heif")
 _MARKER_IN_JPEG_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # stuffed zeros, fill bytes and restarts are no markers
 
 
@@ -43,7 +43,7 @@ def read_image_with_alpha(
     The colours are not multiplied by alpha (except in EXR files, whose definition wants it so).
     """
     path = _checked_file(path)
-    pixels, names, orientation = _decode_heif(path) if path.suffix.lower() in _HEIF_SUFFIXES else _decode(path)
+    pixels, names, orientation = _decode_heif(path) if path.suffix.lower() in HEIF_SUFFIXES else _decode(path)
     if apply_orientation:
         pixels = _upright(pixels, orientation)
     alpha = pixels[names.index("A")][None] if "A" in names else None
@@ -55,11 +55,22 @@ def read_image_with_alpha(
     return repeat(pixels[luminance[0]], "h w -> channels h w", channels=3), alpha
 
 
+def has_alpha(path: str | Path) -> bool:
+    """Whether a still image has an alpha channel, from the file's header (HEIC files are decoded)."""
+    path = _checked_file(path)
+    if path.suffix.lower() in _HEIF_SUFFIXES:
+        return "A" in _decode_heif(path)[1]
+    reader = _opened(path)
+    names = reader.spec().channelnames
+    reader.close()
+    return "A" in names
+
+
 def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int, int]:
     """(height, width) in pixels, upright, from the file's header and its end (a file cut short is refused); nothing is decoded."""
     path = _checked_file(path)
-    if path.suffix.lower() in _HEIF_SUFFIXES:
-        width, height = _opened_heif(path).size
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        width, height = opened_heif(path).size
         return height, width
     reader = _opened(path)
     spec = reader.spec()
@@ -109,6 +120,12 @@ def read_exr(path: str | Path, names: list[str] | None = None) -> dict[str, Floa
     return {name: pixels[stored.index(name)] for name in (stored if names is None else names)}
 
 
+def to_srgb(linear: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Linear light to sRGB values (IEC 61966-2-1); negative light is black, light above 1 stays above 1."""
+    linear = linear.clamp(min=0)
+    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
+
+
 def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tensor, "c height width"]:
     """The image at another size, antialiased (a triangle as wide as the larger of both pixels); corners stay corners.
 
@@ -120,6 +137,23 @@ def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tens
     if tuple(image.shape[1:]) == (height, width):
         return image
     return F.interpolate(image[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False)[0]
+
+
+def shrink(image: Float[Tensor, "c h w"], longest_side: int | None) -> Float[Tensor, "c h2 w2"]:
+    """The image made smaller, so that its longer side has at most ``longest_side`` pixels: each new pixel is the mean of the area it covers.
+
+    An image that is small enough already, or None, comes back as it is. No side becomes shorter than one pixel.
+    """
+    if longest_side is None or max(image.shape[1:]) <= longest_side:
+        return image
+    if longest_side < 1:
+        raise ValueError(f"shrink: expected longest_side of at least 1 pixel, got {longest_side}")
+    import cv2
+
+    scale = longest_side / max(image.shape[1:])
+    height, width = (max(1, round(side * scale)) for side in image.shape[1:])
+    planes = [cv2.resize(plane.numpy(), (width, height), interpolation=cv2.INTER_AREA) for plane in image]
+    return torch.from_numpy(np.stack(planes))
 
 
 # ---- decoding -------------------------------------------------------------------------------------------------------
@@ -218,7 +252,7 @@ def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
 
 def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     """Like :func:`_decode` for HEIC photos; their decoder turns them upright itself."""
-    image = _opened_heif(path)
+    image = opened_heif(path)
     try:
         array = np.array(image)
     except (OSError, RuntimeError, SyntaxError, ValueError) as error:
@@ -227,7 +261,7 @@ def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     return pixels.float() / 255, list(image.mode), 1
 
 
-def _opened_heif(path: Path):
+def opened_heif(path: Path):
     """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency."""
     try:
         import pillow_heif  # pyright: ignore[reportMissingImports]

@@ -1,0 +1,270 @@
+"""What a person brings: a folder of photos, a film or a posed capture, read as one list of photos.
+
+Files are looked at one after the other and only small pictures of them are kept; :meth:`Photo.load` decodes again when pixels are
+needed. What cannot be read is left out and named, as long as two photos remain.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.data import media, video
+from fb_core.data.captures import Frame, read_capture
+from fb_core.data.exif import read_exif
+from fb_core.data.transforms_json import JSON_NAME
+from fb_core.geometry.cameras import Pinholes
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".exr", ".bmp", *media.HEIF_SUFFIXES)
+THUMBNAIL_SIDE = 96
+FILM_FRAMES = 32
+"""How many frames of a film are read when the caller does not say."""
+_logger = logging.getLogger(__name__)
+
+Pixels = tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photo:
+    """One photo, film frame or captured picture, upright and without lens distortion as far as that is known."""
+
+    name: str
+    """Unique within the input, fit for a file name without suffix."""
+    source: Path
+    """The file it comes from; the film for frames."""
+    size: tuple[int, int]
+    """(height, width) in pixels, upright."""
+    focal_prior: float | None
+    """Focal length in pixels of the full-size picture as EXIF data or a capture tells; None = unknown."""
+    device: str
+    """Photos with the same text were taken with the same lens at the same size (up to orientation); "" = nothing is known."""
+    seconds: float | None
+    """Time in the film, or EXIF time since 1970, or None."""
+    camera: Pinholes | None
+    """The camera of the whole picture where its pose is known (a batch of one, float64, the capture's world), else None."""
+    thumbnail: Float[Tensor, "3 h w"] = field(repr=False, compare=False)
+    """The picture with at most ``THUMBNAIL_SIDE`` pixels per side."""
+    pixels: Callable[[], Pixels] = field(repr=False, compare=False)
+    """Decodes colours in [0, 1] and the known-mask at full size."""
+
+    def load(self, longest_side: int | None = None) -> Float[Tensor, "3 h w"]:
+        """The picture, RGB in [0, 1], shrunk by area averages so that no side is longer than ``longest_side`` pixels."""
+        return self.load_with_mask(longest_side)[0]
+
+    def load_mask(self, longest_side: int | None = None) -> Float[Tensor, "1 h w"]:
+        """1 = known: alpha channel, masks of a capture, the inside of a bent lens's picture; ones without. Fractions after shrinking."""
+        return self.load_with_mask(longest_side)[1]
+
+    def load_with_mask(self, longest_side: int | None = None) -> Pixels:
+        """:meth:`load` and :meth:`load_mask` with one decoding. Raises ValueError for a file that has become unreadable."""
+        return _shrunk(self.pixels(), longest_side)
+
+
+def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
+    """The photos of a folder (in natural order of names), of a film (in order of time), or of a posed capture (in its order).
+
+    Args:
+        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a folder with a transforms.json,
+            whose generated views are left out.
+        most: at most so many. Photos are chosen by coverage and keep their order; frames by sharpness and even motion, ``FILM_FRAMES`` of
+            them when None.
+
+    Raises:
+        ValueError: one sentence, when fewer than two photos can be read.
+    """
+    source = Path(source)
+    if most is not None and most < 2:
+        raise ValueError(f"read_photos: expected most of at least 2 photos, got {most}")
+    try:
+        if not source.exists():
+            raise ValueError(f"photos {source}: no such folder or film; check the path")
+        if source.is_dir() and not (source / JSON_NAME).is_file():
+            photos = _of_folder(source)
+        elif source.is_dir() or source.suffix.lower() == ".json":
+            photos = _of_capture(source)
+        else:
+            return _of_film(source, most or FILM_FRAMES)
+    except PermissionError as error:
+        raise ValueError(
+            f"photos {source}: {error.filename or source} may not be read (permission denied); change its permissions"
+        ) from error
+    if most is None or len(photos) <= most:
+        return photos
+    from fb_core.data.photo_choice import choose_by_coverage  # which chooses among photos
+
+    return [photos[index] for index in choose_by_coverage(photos, most)]
+
+
+# ---- folders --------------------------------------------------------------------------------------------------------
+
+
+def _of_folder(folder: Path) -> list[Photo]:
+    files = sorted((path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")), key=natural_order)
+    photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    if not photos:
+        raise ValueError(f"photos {folder}: expected at least 2 photos in the folder, got {_what_else(folder, files)}")
+    names = _unique_names([path.stem for path in photos])
+    return _readable(folder, [lambda path=path, name=name: _still(path, name) for path, name in zip(photos, names, strict=True)])
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """Sorting key of file names in which numbers count as numbers: IMG_2 before IMG_10."""
+    parts = re.findall(r"\d+|\D+", path.name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def _what_else(folder: Path, files: list[Path]) -> str:
+    films = [path for path in files if path.suffix.lower() in video.FILM_SUFFIXES]
+    if films:
+        return f"none but a film; give the film itself: {films[0]}"
+    inside = [path.name for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+    if inside and not files:
+        return f"only folders; give the one with the photos: {folder / inside[0]}"
+    found = ", ".join(sorted({path.suffix.lower() or path.name for path in files})) or "an empty folder"
+    return f"{found}; use JPEG, PNG, WebP, TIFF, EXR or HEIC"
+
+
+def _still(path: Path, name: str) -> Photo:
+    def pixels() -> Pixels:
+        return _still_pixels(path)
+
+    image, mask = pixels()
+    size = (image.shape[1], image.shape[2])
+    exif = read_exif(path, size)
+    lens = f"{exif.camera} {exif.focal_millimetres or 0:g} mm {max(size)} x {min(size)}" if exif.camera else ""
+    return Photo(
+        name=name,
+        source=path,
+        size=size,
+        focal_prior=exif.focal_pixels,
+        device=lens,
+        seconds=exif.seconds,
+        camera=None,
+        thumbnail=_shrunk((image, mask), THUMBNAIL_SIDE)[0],
+        pixels=pixels,
+    )
+
+
+def _still_pixels(path: Path) -> Pixels:
+    image, alpha = media.read_image_with_alpha(path)
+    mask = torch.ones_like(image[:1]) if alpha is None else alpha.clamp(0, 1)
+    if path.suffix.lower() == ".exr":
+        image = media.to_srgb(image / mask.clamp(min=1e-6))  # colours of EXR files are linear and multiplied by alpha
+    finite = torch.isfinite(image).all(dim=0, keepdim=True)
+    return torch.where(finite, image.clamp(0, 1), 0.0), mask * finite
+
+
+# ---- posed captures -------------------------------------------------------------------------------------------------
+
+
+def _of_capture(folder: Path) -> list[Photo]:
+    capture = read_capture(folder)
+    frames = [frame for frame in capture.frames if not frame.extra.get("generated", False)]
+    if len(frames) < len(capture):
+        _logger.info("capture %s: %d generated views are left out", folder, len(capture) - len(frames))
+    names = _unique_names([frame.image_path.stem for frame in frames])
+    return _readable(folder, [lambda frame=frame, name=name: _captured(frame, name) for frame, name in zip(frames, names, strict=True)])
+
+
+def _captured(frame: Frame, name: str) -> Photo:
+    def pixels() -> Pixels:
+        return frame.load_undistorted()[:2]
+
+    image, mask, camera = frame.load_undistorted()
+    intrinsics = [*camera.focal[0].tolist(), *camera.principal[0].tolist(), camera.width, camera.height]
+    return Photo(
+        name=name,
+        source=frame.image_path,
+        size=(camera.height, camera.width),
+        focal_prior=float(camera.focal.mean()),
+        device="capture " + " ".join(f"{value:g}" for value in intrinsics),
+        seconds=None,
+        camera=camera,
+        thumbnail=_shrunk((image, mask), THUMBNAIL_SIDE)[0],
+        pixels=pixels,
+    )
+
+
+# ---- films ----------------------------------------------------------------------------------------------------------
+
+
+def _of_film(path: Path, most: int) -> list[Photo]:
+    if path.suffix.lower() in PHOTO_SUFFIXES:
+        raise ValueError(f"photos {path}: expected a folder of at least 2 photos, or a film, got one photo; give its folder: {path.parent}")
+    film = video.read_film(path, most)
+    return [
+        Photo(
+            name=f"frame_{frame.number:05d}",
+            source=path,
+            size=film.size,
+            focal_prior=None,
+            device=f"film {path.name}",
+            seconds=frame.seconds,
+            camera=None,
+            thumbnail=media.shrink(film.load(frame), THUMBNAIL_SIDE),
+            pixels=lambda frame=frame: _all_known(film.load(frame)),
+        )
+        for frame in film.frames
+    ]
+
+
+def _all_known(image: Float[Tensor, "3 h w"]) -> Pixels:
+    return image, torch.ones_like(image[:1])
+
+
+# ---- what all share -------------------------------------------------------------------------------------------------
+
+
+def _readable(source: Path, readers: list[Callable[[], Photo]]) -> list[Photo]:
+    """The photos that can be read; the others are named in one warning, or in the error when fewer than two remain."""
+    photos, faults = [], []
+    for read in readers:
+        try:
+            photos.append(read())
+        except ValueError as error:
+            faults.append(str(error))
+    if len(photos) < 2:
+        reason = (
+            f" ({len(faults)} cannot be read; the first: {faults[0]})" if faults else "; add photos that show the same scene from elsewhere"
+        )
+        raise ValueError(f"photos {source}: expected at least 2 photos, got {len(photos)}{reason}")
+    for fault in faults:
+        _logger.warning("left out: %s", fault)
+    return photos
+
+
+def _unique_names(stems: list[str]) -> list[str]:
+    """File names for the stems, different even where the file system ignores case; a second IMG_1 becomes IMG_1_2."""
+    names: list[str] = []
+    taken = {_as_file_name(stem).lower() for stem in stems}
+    used: set[str] = set()
+    for stem in stems:
+        name = base = _as_file_name(stem)
+        number = 2
+        while name.lower() in used or (name != base and name.lower() in taken):
+            name, number = f"{base}_{number}", number + 1
+        used.add(name.lower())
+        names.append(name)
+    return names
+
+
+def _as_file_name(stem: str) -> str:
+    return re.sub(r"[^\w.\- ]", "_", stem).strip(". ") or "photo"
+
+
+def _shrunk(pixels: Pixels, longest_side: int | None) -> Pixels:
+    """Area averages of the known pixels; where nothing is known the colour is black."""
+    image, mask = pixels
+    if bool((mask == 1).all()):
+        image = media.shrink(image, longest_side)
+        return image, torch.ones_like(image[:1])
+    small = media.shrink(mask, longest_side)
+    colours = media.shrink(torch.where(mask > 0, image * mask, 0.0), longest_side)
+    return torch.where(small > 0, colours / small.clamp(min=1e-6), 0.0).clamp(0, 1), small
