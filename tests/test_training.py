@@ -15,7 +15,7 @@ from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.training.dit_stage import DiTLossConfig, encode_sequences
 from fb_core.training.linear_start import start_linear
-from fb_core.training.loop import LoopConfig, Run
+from fb_core.training.loop import LoopConfig, Run, Stage, row_generator
 from fb_core.training.recipe import STAGES, Recipe, export, run_stage
 from fb_core.training.vae_stage import VAELossConfig, kl_divergence, reconstruction_error
 from fb_core.views import Views
@@ -104,16 +104,18 @@ def test_latents_are_scaled_to_unit_variance(finished):
 
 
 def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(tmp_path):
-    class Broken:
-        name, network = "broken", torch.nn.Linear(2, 1)
+    class Broken(Stage):
+        name, network, batch = "broken", torch.nn.Linear(2, 1), 4
 
-        def losses(self, step):
-            value = self.network.weight.sum()
-            return {"loss": value * float("nan") if step == 3 else value**2}
+        def draw(self, step, rows):
+            return torch.tensor([float("nan") if step == 3 and row == 2 else 1.0 for row in rows])
+
+        def losses(self, drawn):
+            return {"loss": (self.network.weight.sum() * drawn).square().mean()}
 
     stage = Broken()
     run = Run(stage, dataclasses.replace(_LOOP, steps=9), tmp_path)
-    with pytest.raises(FloatingPointError, match="at step 3"):
+    with pytest.raises(FloatingPointError, match=r"at step 3 \(rows 2 of the batch\); the last good state is .*checkpoint.pt"):
         run.train()
     assert all(torch.isfinite(p).all() for p in stage.network.parameters())
     assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["step"] == 2
@@ -133,15 +135,17 @@ def test_the_transformer_needs_its_autoencoders(tmp_path):
 
 
 def test_the_loop_learns_a_regression(tmp_path):
-    class Regression:
-        name = "regression"
+    class Regression(Stage):
+        name, batch = "regression", 16
 
         def __init__(self):
             self.network = torch.nn.Linear(3, 1)
 
-        def losses(self, step):
-            x = torch.randn(16, 3, generator=seeded(step))
-            return {"loss": (self.network(x) - x.sum(dim=1, keepdim=True)).square().mean()}
+        def draw(self, step, rows):
+            return torch.stack([torch.randn(3, generator=row_generator(0, step, row)) for row in rows])
+
+        def losses(self, drawn):
+            return {"loss": (self.network(drawn) - drawn.sum(dim=1, keepdim=True)).square().mean()}
 
     run = Run(Regression(), LoopConfig(steps=300, learning_rate=0.05, weight_decay=0.0, save_every=300, average=0.9), tmp_path)
     run.train()
@@ -171,7 +175,7 @@ def test_the_pool_is_a_function_of_seed_and_step():
     for step in range(6):
         walked.advance(step)
     jumped.advance(5)
-    first, second = (pool.sequences(2, TOY.dit_loss.task, generator=seeded()) for pool in (walked, jumped))
+    first, second = (pool.sequences(range(2), TOY.dit_loss.task, seeded) for pool in (walked, jumped))
     for field in ("images", "raymaps", "image_known", "rays_known"):
         assert torch.equal(getattr(first, field), getattr(second, field))
     assert first.raymaps[:, :, :3].abs().max() <= 1
@@ -192,7 +196,7 @@ def test_kept_latents_and_shared_encodings_equal_encoding_everything():
     with torch.no_grad():
         pool = RoomPool(TOY.pool, seed=1, encode=image_vae.encode)
         pool.advance(0)
-        batch = pool.sequences(3, TaskConfig(views=5, partial_share=0.4), generator=seeded(2))
+        batch = pool.sequences(range(3), TaskConfig(views=5, partial_share=0.4), lambda row: seeded(20 + row))
         data, conditioning = encode_sequences(batch, image_vae=image_vae, raymap_vae=raymap_vae)
         rays01 = to_unit_range(batch.raymaps)
         for b in range(3):
@@ -208,7 +212,7 @@ def test_linear_start_nearly_reproduces_raymaps():
     network = start_linear(VAE(ROOMS_TINY.raymap_vae), seeded()).eval()
     pool = RoomPool(dataclasses.replace(TOY.pool, image_size=64), seed=1, with_images=False)
     pool.advance(0)
-    errors = reconstruction_error(network, to_unit_range(pool.sequences(2, TaskConfig(views=4), generator=seeded()).raymaps.flatten(0, 1)))
+    errors = reconstruction_error(network, to_unit_range(pool.raymaps(range(8), TaskConfig(views=4), seeded)))
     assert errors["direction_degrees"] < 1.5 and errors["origin_error"] < 0.03
 
 

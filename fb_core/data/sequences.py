@@ -1,6 +1,7 @@
 """Training sequences from procedural rooms: a pool of rendered rooms that is renewed while training goes on.
 
-Everything is a function of (seed, step): the rooms that are in the pool, the views of each sequence, masks and frames.
+Everything is a function of (seed, step, row): the rooms that are in the pool, the views of each sequence, masks and frames. Processes that
+share a batch each draw rows of their own, ``range(part, batch, parts)``, and render only the rooms that these rows can draw from.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,6 +23,8 @@ from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
 from fb_core.masks import drop_conditioning, partly_known
 
 _ROOMS_AT_ONCE = 8  # rendered together
+Draw = Callable[[int], torch.Generator]
+"""The generator, on the CPU, of a row of the batch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,10 +114,25 @@ class RoomPool:
         self._cameras: list[Pinholes | None] = [None] * config.rooms
         self._ids = [-1] * config.rooms
 
-    def advance(self, step: int, on_room: Callable[[int, int], None] | None = None) -> None:
-        """Bring the pool to its state at ``step``: rooms number [k, k + rooms) with k = floor(step * renewed_per_step)."""
+    def slots(self, row: int, batch: int) -> range:
+        """Places in the pool that row ``row`` of a batch draws from: every g-th, g being the greatest common divisor of batch and rooms.
+
+        So n processes that share a batch render an n-th of the rooms each (where n divides g), and draw what one alone would draw.
+        """
+        stride = math.gcd(self.config.rooms, batch)
+        return range(row % stride, self.config.rooms, stride)
+
+    def advance(self, step: int, rows: range | None = None, on_room: Callable[[int, int], None] | None = None) -> None:
+        """Bring the pool to its state at ``step``: rooms number [k, k + rooms) with k = floor(step * renewed_per_step).
+
+        With ``rows`` only those that these rows draw from.
+        """
         first = math.floor(step * self.config.renewed_per_step)
         todo = [room for room in range(first, first + self.config.rooms) if self._ids[room % self.config.rooms] != room]
+        if rows is not None:
+            stride = math.gcd(self.config.rooms, rows.stop)
+            mine = {row % stride for row in rows}
+            todo = [room for room in todo if room % self.config.rooms % stride in mine]
         for start in range(0, len(todo), _ROOMS_AT_ONCE):
             self._render(todo[start : start + _ROOMS_AT_ONCE])
             if on_room is not None:
@@ -138,19 +157,25 @@ class RoomPool:
             if self._encode is not None:
                 self._latents[slot] = self._encode(self._images[slot].float() / 255)
 
-    def images(self, count: int, *, generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
-        """Random single views, for the image autoencoder."""
-        rooms = torch.randint(self.config.rooms, (count,), generator=generator).to(self.device)
-        views = torch.randint(self.config.views, (count,), generator=generator).to(self.device)
-        return self._images[rooms, views].float() / 255
+    def images(self, rows: range, draw: Draw) -> Float[Tensor, "b 3 h w"]:
+        """A random view for each of these rows of a batch, for the image autoencoder."""
+        return torch.stack([self._image(self.slots(row, rows.stop), draw(row)) for row in rows])
 
-    def sequences(self, count: int, task: TaskConfig, *, generator: torch.Generator) -> Sequences:
-        """A batch of training sequences; ``generator`` lives on the CPU."""
-        parts = [self._sequence(task, generator) for _ in range(count)]
+    def _image(self, slots: range, generator: torch.Generator) -> Float[Tensor, "3 h w"]:
+        slot = slots[int(torch.randint(len(slots), (), generator=generator))]
+        return self._images[slot, int(torch.randint(self.config.views, (), generator=generator))].float() / 255
+
+    def raymaps(self, rows: range, task: TaskConfig, draw: Draw) -> Float[Tensor, "b 6 h w"]:
+        """A random view's raymap for each of these rows of a batch, in the frame of the sequence that the view would be part of."""
+        return torch.stack([self._frame(task, self.slots(row, rows.stop), draw(row)).raymaps(row % task.views) for row in rows])
+
+    def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
+        """Training sequences for these rows of a batch."""
+        parts = [self._sequence(task, self.slots(row, rows.stop), draw(row)) for row in rows]
         return Sequences(**{name: torch.stack([part[name] for part in parts]) for name in parts[0]})
 
-    def _sequence(self, task: TaskConfig, generator: torch.Generator) -> dict[str, Tensor]:
-        slot = int(torch.randint(self.config.rooms, (), generator=generator))
+    def _frame(self, task: TaskConfig, slots: range, generator: torch.Generator) -> _Framed:
+        slot = slots[int(torch.randint(len(slots), (), generator=generator))]
         chosen = torch.randperm(self.config.views, generator=generator)[: task.views]
         cameras = self._cameras[slot]
         assert cameras is not None, "advance() renders the pool before sequences are drawn"
@@ -159,15 +184,33 @@ class RoomPool:
         frame = CanonicalFrame.of(
             cameras, heading_radians=2 * math.pi * turn if task.random_heading else 0.0, fill=fill if task.random_fill else 1.0
         )
+        return _Framed(slot, chosen.to(self.device), cameras, frame)
+
+    def _sequence(self, task: TaskConfig, slots: range, generator: torch.Generator) -> dict[str, Tensor]:
+        framed = self._frame(task, slots, generator)
+        slot, chosen = framed.slot, framed.chosen
         image_known, rays_known = draw_task(len(chosen), self.config.image_size, task, generator=generator)
         latents = self._latents[slot]
-        kept = {} if latents is None else {"image_latents": latents[chosen.to(self.device)]}
+        kept = {} if latents is None else {"image_latents": latents[chosen]}
         return kept | {
-            "images": self._images[slot, chosen.to(self.device)].float() / 255,
-            "raymaps": frame.apply(raymaps_of(cameras)),
+            "images": self._images[slot, chosen].float() / 255,
+            "raymaps": framed.raymaps(),
             "image_known": image_known.to(self.device),
             "rays_known": rays_known.to(self.device),
         }
+
+
+class _Framed(NamedTuple):
+    """Views of one room in a canonical frame."""
+
+    slot: int
+    chosen: Tensor
+    cameras: Pinholes
+    frame: CanonicalFrame
+
+    def raymaps(self, view: int | None = None) -> Tensor:
+        """[n, 6, h, w] of all views, or [6, h, w] of one."""
+        return self.frame.apply(raymaps_of(self.cameras)) if view is None else self.frame.apply(raymaps_of(self.cameras[[view]]))[0]
 
 
 def draw_task(count: int, size: int, task: TaskConfig, *, generator: torch.Generator) -> tuple[Tensor, Tensor]:

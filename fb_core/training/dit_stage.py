@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from einops import rearrange
+from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit
@@ -16,7 +18,7 @@ from fb_core.masks import to_latent_grid
 from fb_core.networks.dit import DiT
 from fb_core.networks.embeddings import index_positions
 from fb_core.networks.vae import VAE
-from fb_core.training.loop import step_generator
+from fb_core.training.loop import Stage, row_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,32 +33,53 @@ class DiTLossConfig:
     """Weight of the raymap channels' loss (paper: 1)."""
 
 
-class DiTStage:
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What the transformer is given for some rows of a batch, and what it should answer."""
+
+    inputs: Float[Tensor, "b n 66 h w"]
+    """Noisy latents and conditioning."""
+    times: Float[Tensor, "b"]
+    """Times in (0, 1)."""
+    index: Float[Tensor, "b n"]
+    """Positions of the views."""
+    velocity: Float[Tensor, "b n 32 h w"]
+    """Noise minus data."""
+
+
+class DiTStage(Stage):
     """Trains the transformer with frozen autoencoders."""
 
     name = "dit"
 
     def __init__(self, network: DiT, *, image_vae: VAE, raymap_vae: VAE, pool: RoomPool, config: DiTLossConfig, seed: int):
-        self.network, self.image_vae, self.raymap_vae = (
-            network,
-            image_vae.eval().requires_grad_(False),
-            raymap_vae.eval().requires_grad_(False),
-        )
+        self.network: DiT = network
+        self.image_vae, self.raymap_vae = (vae.eval().requires_grad_(False) for vae in (image_vae, raymap_vae))
         self.pool, self.config, self.seed = pool, config, seed
 
-    def losses(self, step: int) -> dict[str, Tensor]:
-        """Velocity errors of both modalities and their weighted sum."""
-        self.pool.advance(step)
-        draw = step_generator(self.seed, step, 1)
-        sequences = self.pool.sequences(self.config.batch, self.config.task, generator=draw)
+    @property
+    def batch(self) -> int:
+        """Sequences per step."""
+        return self.config.batch
+
+    @torch.no_grad()
+    def draw(self, step: int, rows: range) -> Drawn:
+        """Latents of these rows of a step's batch, on their way between data and noise."""
+        self.pool.advance(step, rows)
+        sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
         data, conditioning = encode_sequences(sequences, image_vae=self.image_vae, raymap_vae=self.raymap_vae)
-        times = logit_normal_times(len(data), generator=draw).to(data.device)
-        noise = torch.randn(data.shape, generator=draw).to(data.device)
-        index = index_positions(self.network.config.index, *data.shape[:2], generator=draw, device=data.device)
-        predicted = self.network(join(at_time(data, noise, times), conditioning), times, None, index)
-        image_error, ray_error = (
-            masked_loss(got, wanted) for got, wanted in zip(split(predicted), split(velocity(data, noise)), strict=True)
-        )
+        generators = [row_generator(self.seed, step, row, 1) for row in rows]
+        times = torch.cat([logit_normal_times(1, generator=generator) for generator in generators]).to(data.device)
+        noise = torch.stack([torch.randn(data.shape[1:], generator=generator) for generator in generators]).to(data)
+        mode, views = self.network.config.index, data.shape[1]
+        index = torch.cat([index_positions(mode, 1, views, generator=generator) for generator in generators]).to(data.device)
+        inputs = join(at_time(data, noise, times), conditioning)
+        return Drawn(inputs=inputs, times=times, index=index, velocity=velocity(data, noise))
+
+    def losses(self, drawn: Drawn) -> dict[str, Tensor]:
+        """Velocity errors of both modalities and their weighted sum."""
+        predicted = self.network(drawn.inputs, drawn.times, None, drawn.index)
+        image_error, ray_error = (masked_loss(got, wanted) for got, wanted in zip(split(predicted), split(drawn.velocity), strict=True))
         return {"loss": image_error + self.config.ray_weight * ray_error, "image": image_error, "rays": ray_error}
 
 

@@ -1,41 +1,69 @@
-"""The training loop: AdamW, an average of the weights, exact resume, atomic checkpoints, a JSON log and a loss curve.
+"""The training loop: optimiser, an average of the weights, exact resume; on one process or many, which then share each step's batch.
 
-Every random draw of a step comes from generators derived from (seed, step), so a run that was killed continues as if it had not been.
+Every random draw of a row of a batch comes from generators derived from (seed, step, row). So a run that was killed continues as if it had
+not been, and so does one that is resumed by another number of processes, or in more or fewer parts per step.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from fb_core.networks.blocks import Block
+from fb_core.networks.dit import DiT
+from fb_core.networks.vae import Resnet
+from fb_core.sampling.randomness import generator_of
+from fb_core.training.checkpoints import Checkpoints
+from fb_core.training.distributed import ALONE, Group, averaged_if, averaging, own_part, shard, spread, whole
+from fb_core.training.interruption import StopSignal
+from fb_core.training.optimizers import OPTIMIZERS, OptimizerName, clip_gradients, load_optimizer, make_optimizers
+from fb_core.training.progress_log import ProgressLog
 
 _logger = logging.getLogger(__name__)
 OnProgress = Callable[[int, int, dict[str, float]], None]
 """(steps done, steps in all, latest smoothed losses)."""
+OnSheet = Callable[[Path, dict[str, Tensor]], None]
+"""Draws a sample sheet (a file to write) of the averaged weights."""
 
 
-@runtime_checkable
-class Stage(Protocol):
-    """One thing that is trained: a network and the loss of a step."""
+class Stage(ABC):
+    """One thing that is trained: a network, the data of a step, and their loss.
+
+    Rows of a step's batch are numbered from 0; a process asks for some of them, ``range(part, batch, parts)``. What a row holds depends on
+    (seed, step, row) alone. Losses are means over rows, so that the mean over equal parts is the loss of the batch.
+    """
+
+    name: str
+    """Names the stage's folder."""
+    network: nn.Module
+    """What is trained, averaged and exported."""
+    critic: nn.Module | None = None
+    """A further network that is optimised beside it, such as a discriminator. Its loss is part of ``loss``; it is up to the stage that
+    neither network gets gradients of the other's loss."""
 
     @property
-    def name(self) -> str: ...
+    @abstractmethod
+    def batch(self) -> int:
+        """Rows of a step's batch, over all processes."""
 
-    @property
-    def network(self) -> nn.Module: ...
+    @abstractmethod
+    def draw(self, step: int, rows: range) -> Any:
+        """The data of these rows; no gradients, full precision. Steps are asked for in order, perhaps ahead from another thread."""
 
-    def losses(self, step: int) -> dict[str, Tensor]:
-        """Losses of step ``step``; the entry ``loss`` is what is minimised. Deterministic in the step."""
-        ...
+    @abstractmethod
+    def losses(self, drawn: Any) -> dict[str, Tensor]:
+        """Mean losses over what was drawn; the entry ``loss`` is what is minimised."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +73,7 @@ class LoopConfig:
     steps: int = 1000
     """Optimiser steps in all."""
     learning_rate: float = 6e-4
-    """Peak learning rate of AdamW."""
+    """Peak learning rate."""
     warmup_steps: int = 50
     """Steps over which the rate rises linearly from 0."""
     cooldown: float = 0.2
@@ -60,18 +88,50 @@ class LoopConfig:
     """Decay per step of the exponential average of the weights that is exported; 0 exports the last weights."""
     save_every: int = 200
     """Steps between checkpoints."""
+    optimizer: OptimizerName = "adamw"
+    """adamw, or muon for the matrices of the transformer's blocks (fast on a GPU only)."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.save_every < 1:
             raise ValueError(f"training: steps and save_every must be at least 1, got {self.steps} and {self.save_every}")
         if not 0 <= self.cooldown <= 1 or not 0 <= self.average < 1:
             raise ValueError(f"training: cooldown must lie in [0, 1] and average in [0, 1), got {self.cooldown} and {self.average}")
+        if self.optimizer not in OPTIMIZERS:
+            raise ValueError(f"training: expected an optimizer out of {list(OPTIMIZERS)}, got {self.optimizer!r}")
 
     def rate(self, step: int) -> float:
         """Learning rate of step ``step`` (0-based)."""
         warm = min(1.0, (step + 1) / max(1, self.warmup_steps))
         left = (self.steps - step) / max(1.0, self.cooldown * self.steps)
         return self.learning_rate * min(warm, 1.0, max(0.0, left))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineConfig:
+    """How the machine does it; but for rounding, none of this changes what is learned."""
+
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of matrix products and convolutions (autocast); weights, their average, norms and losses stay in float32."""
+    accumulate: int = 1
+    """Parts that a process does its rows of a batch in, one after the other."""
+    recompute: bool = False
+    """Keep no activations inside blocks; compute them again in the backward pass."""
+    shard: bool = False
+    """Spread the transformer over the processes (FSDP) instead of holding it whole on each."""
+    draw_ahead: bool = False
+    """Prepare the next step's data in another thread; pays where data are made on the CPU for a GPU."""
+    keep: int = 2
+    """Checkpoints kept, the newest included."""
+    sheet_every: int = 0
+    """Steps between sample sheets; 0 for none."""
+    tensorboard: bool = False
+    """Write TensorBoard's files beside log.jsonl."""
+
+    def __post_init__(self) -> None:
+        if self.accumulate < 1 or self.keep < 1 or self.sheet_every < 0:
+            raise ValueError(f"training: accumulate and keep must be at least 1 and sheet_every at least 0, got {self}")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ValueError(f"training: expected precision float32 or bfloat16, got {self.precision!r}")
 
 
 class Averaged:
@@ -81,144 +141,276 @@ class Averaged:
         self.decay, self.updates = decay, 0
         self.values = {name: value.detach().clone() for name, value in network.state_dict().items()}
 
+    @torch.no_grad()
     def update(self, network: nn.Module) -> None:
         """Take the network's present state in."""
         self.updates += 1
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
-        for name, value in network.state_dict().items():
-            self.values[name].lerp_(value.detach(), 1 - decay)
+        state = network.state_dict()
+        mine, new = ([own_part(values[name]) for name in self.values] for values in (self.values, state))
+        torch._foreach_lerp_(mine, new, 1 - decay)
+
+
+class _Step(nn.Module):
+    """A stage's losses as a module's forward pass, which is what DistributedDataParallel wraps."""
+
+    def __init__(self, stage: Stage):
+        super().__init__()
+        self.network, self.critic = stage.network, stage.critic
+        self._losses = stage.losses
+
+    def forward(self, drawn: Any) -> dict[str, Tensor]:
+        return self._losses(drawn)
 
 
 class Run:
-    """A training run in a folder: ``checkpoint.pt`` (resume), ``log.jsonl`` (losses), ``loss.png`` (curve)."""
+    """A training run in a folder: ``checkpoint.pt`` and those before it, ``log.jsonl`` (losses), ``loss.png`` (curve), ``sheets``."""
 
-    def __init__(self, stage: Stage, config: LoopConfig, folder: Path):
-        self.stage, self.config, self.folder = stage, config, folder
-        folder.mkdir(parents=True, exist_ok=True)
-        matrices = [p for p in stage.network.parameters() if p.requires_grad and p.ndim >= 2]
-        vectors = [p for p in stage.network.parameters() if p.requires_grad and p.ndim < 2]
-        groups = [{"params": matrices, "weight_decay": config.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=config.betas, foreach=True)
+    def __init__(
+        self,
+        stage: Stage,
+        config: LoopConfig,
+        folder: Path | None,
+        *,
+        preset: str = "",
+        engine: EngineConfig = EngineConfig(),
+        group: Group = ALONE,
+        on_sheet: OnSheet | None = None,
+    ):
+        """Resumes what is in ``folder``; without one nothing is written.
+
+        Raises ValueError for a batch that the processes cannot share equally, and for a checkpoint of another stage, preset or batch.
+        """
+        self.stage, self.config, self.folder, self.preset = stage, config, folder, preset
+        self.engine, self.group, self._on_sheet = engine, group, on_sheet
+        parts = group.size * engine.accumulate
+        if stage.batch % parts:
+            raise ValueError(
+                f"{stage.name}: expected a batch that {group.size} processes can share equally in {engine.accumulate} parts each, "
+                f"got {stage.batch}"
+            )
+        self.parts = [range(number * group.size + group.rank, stage.batch, parts) for number in range(engine.accumulate)]
+        """Rows that this process does, part by part."""
+        sharded = engine.shard and group.size > 1 and isinstance(stage.network, DiT)
+        if sharded and config.optimizer == "muon":
+            raise ValueError("training: muon needs whole matrices; choose adamw for a sharded transformer")
+        if engine.recompute:
+            _recompute_blocks(stage.network)
+        if sharded:
+            shard(stage.network)  # type: ignore[arg-type]
+        self.optimizers = make_optimizers(
+            stage.network, name=config.optimizer, learning_rate=config.learning_rate, weight_decay=config.weight_decay, betas=config.betas
+        )
+        if stage.critic is not None:
+            self.optimizers += make_optimizers(
+                stage.critic, name="adamw", learning_rate=config.learning_rate, weight_decay=config.weight_decay, betas=config.betas
+            )
+        self._module = averaging(_Step(stage), group, sharded=sharded)
         self.average = Averaged(stage.network, config.average)
         self.step = 0
         self.seconds = 0.0
+        self.waited = 0.0
+        """Seconds of these in which data were made or waited for."""
         self.smoothed: dict[str, float] = {}
-        if (folder / "checkpoint.pt").exists():
-            self._resume()
+        self.signal = 0
+        """The signal that ended the training early, if any."""
+        self._ahead: tuple[int, Future] | None = None
+        self._checkpoints = self._log = None
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._checkpoints = Checkpoints(folder, engine.keep)
+            if (path := self._checkpoints.find()) is not None:
+                self._resume(path)
+            group.wait()
+            if group.is_main:
+                self._log = ProgressLog(folder, stage.name, from_step=self.step, tensorboard=engine.tensorboard)
 
     def train(self, *, on_progress: OnProgress | None = None, minutes: float = math.inf) -> None:
-        """Go on to the last step (or until the time is up), saving now and then and at the end.
+        """Go on to the last step, or until the time is up or a signal asks to stop; saves now and then and at the end.
 
-        Raises FloatingPointError when a loss is not finite; the last checkpoint then still holds the last good state.
+        Raises FloatingPointError when a loss or gradient is not finite; the last checkpoint then still holds the last good state.
         """
-        begun = time.monotonic()
+        until = time.monotonic() + 60 * minutes
         self.stage.network.train()
-        while self.step < self.config.steps and time.monotonic() - begun < 60 * minutes:
-            started = time.monotonic()
-            self._one_step()
-            self.seconds += time.monotonic() - started
-            if on_progress is not None:
-                on_progress(self.step, self.config.steps, self.smoothed)
-            if self.step % self.config.save_every == 0:
-                self.save()
+        with StopSignal() as stop, ThreadPoolExecutor(1) as ahead:
+            while self.step < self.config.steps and not self.group.any(bool(stop.number) or time.monotonic() >= until):
+                started = time.monotonic()
+                losses = self._one_step(ahead)
+                self.seconds += time.monotonic() - started
+                self._tell(losses, time.monotonic() - started, on_progress)
+                if self.step % self.config.save_every == 0:
+                    self.save()
+                if self.engine.sheet_every and self.step % self.engine.sheet_every == 0:
+                    self._draw_sheet()
+            self._ahead = None
+            self.signal = int(max(self.group.gather(stop.number)))
         self.save()
-        self._draw_curve()
+        if self._log is not None:
+            self._log.close()
 
     def averaged_state(self) -> dict[str, Tensor]:
-        """The state to export: the average, or the last weights when averaging is off."""
-        return self.average.values if self.config.average > 0 else self.stage.network.state_dict()
+        """The state to export: the average, or the last weights when averaging is off. All processes must ask."""
+        return whole(self.average.values if self.config.average > 0 else self.stage.network.state_dict())
 
     def record(self) -> dict:
         """What is worth keeping about this run, for the exported model's ``info``."""
         return {"stage": self.stage.name, "steps": self.step, "seconds": round(self.seconds), "losses": self.smoothed}
 
-    def _one_step(self) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.rate(self.step)
-        losses = self.stage.losses(self.step)
-        loss = losses["loss"]
-        if not bool(torch.isfinite(loss)):
-            raise FloatingPointError(
-                f"{self.stage.name}: the loss became {float(loss.detach())} at step {self.step}; "
-                f"the last good state is {self.folder / 'checkpoint.pt'}"
-            )
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.stage.network.parameters(), self.config.clip)
-        self.optimizer.step()
+    def _one_step(self, ahead: ThreadPoolExecutor) -> dict[str, float]:
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for parameters in optimizer.param_groups:
+                parameters["lr"] = self.config.rate(self.step)
+        found: list[dict[str, Tensor]] = []
+        for number, rows in enumerate(self.parts):
+            drawn = self._drawn(number, ahead)
+            with averaged_if(self._module, self.stage.network, last=rows is self.parts[-1]):
+                with self._autocast():
+                    losses = self._module(drawn)
+                (losses["loss"] / len(self.parts)).backward()
+            found.append({name: value.detach() for name, value in losses.items()})
+        means = {name: float(torch.stack([losses[name] for losses in found]).mean()) for name in found[0]}
+        means = dict(zip(means, self.group.mean(list(means.values())), strict=True))
+        self._require_finite("loss", means["loss"])
+        self._require_finite("gradient's norm", clip_gradients(self.stage.network, self.config.clip))
+        if self.stage.critic is not None:
+            self._require_finite("critic's gradient's norm", clip_gradients(self.stage.critic, self.config.clip))
+        for optimizer in self.optimizers:
+            optimizer.step()
         self.average.update(self.stage.network)
         self.step += 1
-        values = {name: float(value.detach()) for name, value in losses.items()}
+        return means
+
+    def _drawn(self, number: int, ahead: ThreadPoolExecutor) -> Any:
+        """The data of a part of this step; with ``draw_ahead`` they are there already, and the next part's are begun."""
+        began = time.monotonic()
+        place = self.step * len(self.parts) + number
+        if self._ahead is not None and self._ahead[0] == place:
+            drawn = self._ahead[1].result()
+        else:
+            drawn = self._draw_place(place)
+        if self.engine.draw_ahead and place + 1 < self.config.steps * len(self.parts):
+            self._ahead = place + 1, ahead.submit(self._draw_place, place + 1)
+        self.waited += time.monotonic() - began
+        return drawn
+
+    def _draw_place(self, place: int) -> Any:
+        step, number = divmod(place, len(self.parts))
+        return self.stage.draw(step, self.parts[number])
+
+    def _autocast(self) -> torch.autocast:
+        device = next(self.stage.network.parameters()).device.type
+        return torch.autocast(device, torch.bfloat16, enabled=self.engine.precision == "bfloat16")
+
+    def _tell(self, losses: dict[str, float], seconds: float, on_progress: OnProgress | None) -> None:
         keep = min(0.98, 1 - 1 / self.step)
-        self.smoothed = {name: keep * self.smoothed.get(name, value) + (1 - keep) * value for name, value in values.items()}
-        with (self.folder / "log.jsonl").open("a") as log:
-            log.write(json.dumps({"step": self.step, **{name: round(value, 6) for name, value in values.items()}}) + "\n")
+        self.smoothed = {name: keep * self.smoothed.get(name, value) + (1 - keep) * value for name, value in losses.items()}
+        if self._log is not None:
+            speed = {"steps per second": 1 / max(seconds, 1e-9), "data share": self.waited / max(self.seconds, 1e-9)}
+            self._log.add(self.step, losses, speed)
+        if on_progress is not None:
+            on_progress(self.step, self.config.steps, self.smoothed)
+
+    def _require_finite(self, what: str, value: float) -> None:
+        if math.isfinite(value):
+            return
+        where = self._checkpoints.find() if self._checkpoints is not None else None
+        kept = f"the last good state is {where}" if where else "there is no checkpoint yet"
+        rows = ", ".join(map(str, sorted(row for rows in self.group.gather(self._bad_rows()) for row in rows)))
+        blamed = f" (rows {rows} of the batch)" if rows else ""
+        raise FloatingPointError(f"{self.stage.name}: the {what} became {value} at step {self.step}{blamed}; {kept}")
+
+    @torch.no_grad()
+    def _bad_rows(self) -> list[int]:
+        """Which of this process's rows have a loss that is not finite, each by itself."""
+        bad = []
+        for row in (row for rows in self.parts for row in rows):
+            with self._autocast():
+                loss = self.stage.losses(self.stage.draw(self.step, range(row, self.stage.batch, self.stage.batch)))["loss"]
+            if not bool(torch.isfinite(loss)):
+                bad.append(row)
+        return bad
+
+    def _draw_sheet(self) -> None:
+        """All processes come here, as the average may be spread over them; one draws."""
+        if self._on_sheet is None or self.folder is None:
+            return
+        state = self.averaged_state()
+        if self.group.is_main:
+            path = self.folder / "sheets" / f"{self.step:06d}.png"
+            path.parent.mkdir(exist_ok=True)
+            self._on_sheet(path, state)
+        self.group.wait()
 
     def save(self) -> None:
-        """Write the checkpoint; a kill or a full disk while writing leaves the previous one whole."""
+        """Write the checkpoint; all processes come here, one writes. A kill or a full disk meanwhile leaves the previous one whole."""
+        if self._checkpoints is None:
+            return
+        parts = {
+            "network": self.stage.network.state_dict(),
+            "optimizer": [optimizer.state_dict() for optimizer in self.optimizers],
+            "average": self.average.values,
+        } | ({} if self.stage.critic is None else {"critic": self.stage.critic.state_dict()})
         state = {
             "stage": self.stage.name,
+            "preset": self.preset,
+            "batch": self.stage.batch,
             "step": self.step,
             "seconds": self.seconds,
+            "waited": self.waited,
             "smoothed": self.smoothed,
-            "network": self.stage.network.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "average": self.average.values,
             "average_updates": self.average.updates,
-        }
-        temporary = self.folder / f"checkpoint.pt.{os.getpid()}"
-        try:
-            torch.save(state, temporary)
-            temporary.replace(self.folder / "checkpoint.pt")
-        finally:
-            temporary.unlink(missing_ok=True)
+        } | whole(parts, keep=self.group.is_main)
+        if self.group.is_main:
+            self._checkpoints.write(state)
+        self.group.wait()
 
-    def _resume(self) -> None:
-        path = self.folder / "checkpoint.pt"
-        state = torch.load(path, weights_only=True, map_location=next(self.stage.network.parameters()).device)
-        if state["stage"] != self.stage.name:
-            raise ValueError(f"{path} holds stage {state['stage']!r}, expected {self.stage.name!r}; choose another output folder")
+    def _resume(self, path: Path) -> None:
+        assert self._checkpoints is not None
+        network, critic = self.stage.network, self.stage.critic
+        state = self._checkpoints.read(path, next(network.parameters()).device)
+        expected = {"stage": self.stage.name, "preset": self.preset, "batch": self.stage.batch}
+        for what, mine in expected.items():
+            theirs = state.get(what, mine)  # earlier checkpoints name their stage only
+            if theirs != mine and theirs and mine:
+                raise ValueError(f"{path} holds {what} {theirs!r}, expected {mine!r}; choose another output folder")
         try:
-            self.stage.network.load_state_dict(state["network"])
-        except RuntimeError as error:
+            _load(network, state["network"])
+            if critic is not None:
+                _load(critic, state["critic"])
+        except (RuntimeError, KeyError) as error:
             raise ValueError(f"{path} was made by another preset than this one; choose another output folder ({error})") from error
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.average.values, self.average.updates = state["average"], state["average_updates"]
-        self.step, self.seconds, self.smoothed = state["step"], state["seconds"], state["smoothed"]
-        self._forget_after(self.step)
+        saved = state["optimizer"] if isinstance(state["optimizer"], list) else [state["optimizer"]]
+        if len(saved) != len(self.optimizers):
+            raise ValueError(f"{path} was made with another optimizer than {self.config.optimizer!r}; choose another output folder")
+        for optimizer, values in zip(self.optimizers, saved, strict=True):
+            load_optimizer(optimizer, values)
+        like = network.state_dict()
+        self.average.values = {name: spread(value, like[name]) for name, value in state["average"].items()}
+        self.average.updates = state["average_updates"]
+        self.step, self.seconds, self.waited = state["step"], state["seconds"], state.get("waited", 0.0)
+        self.smoothed = state["smoothed"]
         _logger.info("%s: resumed at step %d from %s", self.stage.name, self.step, path)
 
-    def _forget_after(self, step: int) -> None:
-        """Drop the log's lines of steps that will be done again."""
-        log = self.folder / "log.jsonl"
-        if log.exists():
-            kept = [line for line in log.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= step]
-            log.write_text("".join(line + "\n" for line in kept))
 
-    def _draw_curve(self) -> None:
-        if not self.step:
-            return
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        rows = [json.loads(line) for line in (self.folder / "log.jsonl").read_text().splitlines()]
-        if len(rows) < 2:
-            return
-        figure, axes = pyplot.subplots(figsize=(6, 3.5), layout="constrained")
-        width = max(1, len(rows) // 100)
-        for name in rows[0]:
-            if name != "step":
-                values = [row[name] for row in rows]
-                means = [sum(values[k : k + width]) / len(values[k : k + width]) for k in range(0, len(values), width)]
-                axes.plot([rows[k]["step"] for k in range(0, len(rows), width)], means, label=name)
-        axes.set(xlabel="step", ylabel="loss", yscale="log", title=self.stage.name)
-        axes.legend()
-        figure.savefig(self.folder / "loss.png", dpi=120)
-        pyplot.close(figure)
+def _load(network: nn.Module, state: dict[str, Tensor]) -> None:
+    """Load whole weights into a network that may be spread over processes."""
+    like = network.state_dict()
+    network.load_state_dict({name: spread(value, like[name]) if name in like else value for name, value in state.items()})
 
 
-def step_generator(seed: int, step: int, stream: int = 0, device: torch.device | str = "cpu") -> torch.Generator:
-    """A generator for one purpose (``stream``) of one step."""
-    return torch.Generator(device=device).manual_seed((seed * 1_000_003 + step) * 101 + stream)
+def _recompute_blocks(network: nn.Module) -> None:
+    """Let every block forget its activations until the backward pass, which computes them again."""
+    for block in network.modules():
+        if isinstance(block, Block | Resnet):
+            forward = block.forward
+
+            def forgetting(*inputs: Any, _forward: Callable = forward) -> Any:
+                return checkpoint(_forward, *inputs, use_reentrant=False)
+
+            block.forward = forgetting  # type: ignore[method-assign]
+
+
+def row_generator(seed: int, step: int, row: int, stream: int = 0) -> torch.Generator:
+    """A CPU generator for one purpose (``stream``) of one row of a step's batch."""
+    return generator_of(seed, step, row, stream)

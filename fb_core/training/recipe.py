@@ -125,7 +125,7 @@ def _record_spread(task: VAEStage, averaged: dict, folder: Path) -> None:
     """Write the scaling that gives the trained latents unit variance, and how well the autoencoder reconstructs."""
     task.network.load_state_dict(averaged)
     task.network.eval()
-    values = torch.cat([task.batch(-1 - k) for k in range(16)])
+    values = torch.cat([task.values(-1 - k, range(task.batch)) for k in range(16)])
     mean, _ = task.network.posterior(values)
     rows = {"scaling": 1.0 / float(mean.std()), "views": len(values), **reconstruction_error(task.network, values)}
     (folder / "spread.json").write_text(json.dumps(rows, indent=1) + "\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from torch import Tensor
 from fb_core.data.sequences import RoomPool, TaskConfig
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.networks.vae import VAE
-from fb_core.training.loop import step_generator
+from fb_core.training.loop import Stage, row_generator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +32,7 @@ def kl_divergence(mean: Float[Tensor, "b c h w"], logvar: Float[Tensor, "b c h w
     return 0.5 * (mean.square() + logvar.exp() - 1 - logvar).flatten(1).sum(dim=1).mean()
 
 
-class VAEStage:
+class VAEStage(Stage):
     """Trains one autoencoder on images or on raymaps of a pool of rooms."""
 
     def __init__(self, network: VAE, pool: RoomPool, *, kind: str, config: VAELossConfig, seed: int):
@@ -43,21 +44,31 @@ class VAEStage:
         # Raymaps are seen under every heading and scale: the autoencoder must not know the frame.
         self._task = TaskConfig(views=min(4, pool.config.views), random_heading=True, random_fill=True)
 
-    def batch(self, step: int) -> Float[Tensor, "b c h w"]:
-        """What is encoded at a step, in [0, 1]."""
-        generator = step_generator(self.seed, step, 1)
-        if self.name == "image-vae":
-            return self.pool.images(self.config.batch, generator=generator)
-        groups = -(-self.config.batch // self._task.views)
-        raymaps = self.pool.sequences(groups, self._task, generator=generator).raymaps
-        return to_unit_range(raymaps.flatten(0, 1)[: self.config.batch])
+    @property
+    def batch(self) -> int:
+        """Images (or raymaps) per step."""
+        return self.config.batch
 
-    def losses(self, step: int) -> dict[str, Tensor]:
+    def values(self, step: int, rows: range) -> Float[Tensor, "b c h w"]:
+        """What is encoded in these rows of a step's batch, in [0, 1]."""
+        draw = partial(row_generator, self.seed, step)
+        if self.name == "image-vae":
+            return self.pool.images(rows, draw)
+        return to_unit_range(self.pool.raymaps(rows, self._task, draw))
+
+    def draw(self, step: int, rows: range) -> tuple[Tensor, Tensor]:
+        """(values in [0, 1], standard normal noise of their latents)."""
+        self.pool.advance(step, rows)
+        target = self.values(step, rows)
+        config = self.network.config
+        shape = config.latent_channels, target.shape[-2] // config.factor, target.shape[-1] // config.factor
+        noise = torch.stack([torch.randn(shape, generator=row_generator(self.seed, step, row, 1)) for row in rows])
+        return target, noise.to(target)
+
+    def losses(self, drawn: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """L1, KL and their weighted sum."""
-        self.pool.advance(step)
-        target = self.batch(step)
+        target, noise = drawn
         mean, logvar = self.network.posterior(target)
-        noise = torch.randn(mean.shape, generator=step_generator(self.seed, step, 2)).to(mean)
         latent = mean + (0.5 * logvar).exp() * noise
         reconstruction = self.network.decode(latent * self.network.config.scaling, clamp=False)
         l1 = 2 * (reconstruction - target).abs().mean()  # in the network's own range [-1, 1]

@@ -1,0 +1,57 @@
+"""Checkpoints of a training: written whole or not at all, the last few kept."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+NEWEST = "checkpoint.pt"
+
+
+class Checkpoints:
+    """``checkpoint.pt`` in a folder is the newest; ``checkpoint-000200.pt`` are those before it, named by their steps."""
+
+    def __init__(self, folder: Path, keep: int):
+        self.folder, self.keep = folder, keep
+        self._newest_step: int | None = None
+
+    def find(self) -> Path | None:
+        """The newest checkpoint, if there is one."""
+        newest = self.folder / NEWEST
+        return newest if newest.exists() else next(reversed(self._earlier()), None)
+
+    def read(self, path: Path, device: torch.device) -> dict[str, Any]:
+        """A checkpoint's content. Raises ValueError if the file is damaged, naming the one before it."""
+        try:
+            state = torch.load(path, weights_only=True, map_location=device)
+        except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            before = [str(other) for other in self._earlier() if other != path]
+            advice = f"delete it to go on from {before[-1]}" if before else "delete it to begin anew"
+            raise ValueError(f"{path} is damaged ({error}); {advice}") from error
+        self._newest_step = state["step"]
+        return state
+
+    def write(self, state: dict[str, Any]) -> None:
+        """Make ``state`` the newest checkpoint; a kill or a full disk while writing leaves the previous ones whole."""
+        newest, temporary = self.folder / NEWEST, self.folder / f"{NEWEST}.{os.getpid()}"
+        try:
+            with temporary.open("wb") as file:
+                torch.save(state, file)
+                file.flush()
+                os.fsync(file.fileno())  # else a power cut could leave the new name on an empty file
+            if self.keep > 1 and newest.exists() and self._newest_step not in (None, state["step"]):
+                newest.rename(self.folder / f"checkpoint-{self._newest_step:06d}.pt")
+            temporary.replace(newest)
+        finally:
+            temporary.unlink(missing_ok=True)
+        self._newest_step = state["step"]
+        for old in self._earlier()[: max(0, len(self._earlier()) - (self.keep - 1))]:
+            old.unlink()
+
+    def _earlier(self) -> list[Path]:
+        """From the oldest to the newest."""
+        return sorted(self.folder.glob("checkpoint-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))

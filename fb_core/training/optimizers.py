@@ -1,0 +1,60 @@
+"""Optimisers of a training step: AdamW, or Muon for the matrices inside the transformer's blocks; and their gradients' norm."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from fb_core.training.distributed import spread
+
+OptimizerName = Literal["adamw", "muon"]
+OPTIMIZERS: tuple[OptimizerName, ...] = get_args(OptimizerName)
+_BLOCKS = ("transformer_blocks.",)
+
+
+def make_optimizers(
+    network: nn.Module, *, name: OptimizerName, learning_rate: float, weight_decay: float, betas: tuple[float, float]
+) -> list[Optimizer]:
+    """The optimisers of a network; vectors (gains, biases) have no weight decay.
+
+    Muon (Jordan et al. 2024) takes the matrices of the transformer's blocks, AdamW all else; Muon's step is scaled to AdamW's usual size,
+    so that one learning rate serves both. Raises ValueError where torch has no Muon.
+    """
+    matrices, vectors, orthogonal = [], [], []
+    for parameter_name, parameter in network.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        if name == "muon" and parameter.ndim == 2 and parameter_name.startswith(_BLOCKS):
+            orthogonal.append(parameter)
+        else:
+            (matrices if parameter.ndim >= 2 else vectors).append(parameter)
+    groups = [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
+    optimizers: list[Optimizer] = [torch.optim.AdamW(groups, lr=learning_rate, betas=betas, foreach=True)]
+    if orthogonal:
+        if not hasattr(torch.optim, "Muon"):
+            raise ValueError(f"optimizer: torch {torch.__version__} has no Muon; choose adamw, or torch 2.9 or later")
+        optimizers.append(torch.optim.Muon(orthogonal, lr=learning_rate, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw"))
+    return optimizers
+
+
+def load_optimizer(optimizer: Optimizer, state: dict) -> None:
+    """Take a saved state in, spread over the processes as the parameters are."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    spread_state = {
+        number: {key: spread(value, parameters[number]) if _follows(value, parameters[number]) else value for key, value in entry.items()}
+        for number, entry in state["state"].items()
+    }
+    optimizer.load_state_dict({**state, "state": spread_state})
+
+
+def _follows(value: object, parameter: Tensor) -> bool:
+    return isinstance(value, Tensor) and value.shape == parameter.shape and value.ndim > 0
+
+
+def clip_gradients(network: nn.Module, largest: float) -> float:
+    """Scale gradients so that their norm is at most ``largest``; returns the norm that they had."""
+    norm = nn.utils.clip_grad_norm_(network.parameters(), largest)
+    return float(norm.full_tensor() if hasattr(norm, "full_tensor") else norm)  # type: ignore[attr-defined]

@@ -1,0 +1,72 @@
+"""What a training leaves to read: ``log.jsonl`` with every step's losses, ``loss.png``, and TensorBoard's files on demand."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+_logger = logging.getLogger(__name__)
+
+
+class ProgressLog:
+    """The log in a training's folder."""
+
+    def __init__(self, folder: Path, title: str, *, from_step: int, tensorboard: bool = False):
+        """Lines of steps after ``from_step``, which will be done again, are dropped."""
+        self.folder, self.title = folder, title
+        self._path = folder / "log.jsonl"
+        self._board = _board(folder / "tensorboard", from_step) if tensorboard else None
+        if self._path.exists():
+            kept = [line for line in self._path.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= from_step]
+            self._path.write_text("".join(line + "\n" for line in kept))
+
+    def add(self, step: int, losses: dict[str, float], speed: dict[str, float]) -> None:
+        """Note a step; ``speed`` goes to TensorBoard alone, so that two logs of one training are the same."""
+        with self._path.open("a") as log:
+            log.write(json.dumps({"step": step, **{name: round(value, 6) for name, value in losses.items()}}) + "\n")
+        if self._board is not None:
+            for name, value in losses.items():
+                self._board.add_scalar(f"loss/{name}", value, step)
+            for name, value in speed.items():
+                self._board.add_scalar(f"speed/{name}", value, step)
+
+    def close(self) -> None:
+        """Draw the curve of all losses."""
+        if self._board is not None:
+            self._board.flush()
+        if self._path.exists():
+            self._draw([json.loads(line) for line in self._path.read_text().splitlines()])
+
+    def _draw(self, rows: list[dict[str, float]]) -> None:
+        if len(rows) < 2:
+            return
+        try:
+            import matplotlib
+        except ImportError:
+            _logger.info("%s: no loss.png, because matplotlib is not installed; log.jsonl has the numbers", self.title)
+            return
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+
+        figure, axes = pyplot.subplots(figsize=(6, 3.5), layout="constrained")
+        width = max(1, len(rows) // 100)
+        for name in rows[0]:
+            if name != "step":
+                values = [row[name] for row in rows]
+                means = [sum(values[k : k + width]) / len(values[k : k + width]) for k in range(0, len(values), width)]
+                axes.plot([rows[k]["step"] for k in range(0, len(rows), width)], means, label=name)
+        axes.set(xlabel="step", ylabel="loss", yscale="log", title=self.title)
+        axes.legend()
+        figure.savefig(self.folder / "loss.png", dpi=120)
+        pyplot.close(figure)
+
+
+def _board(folder: Path, from_step: int):
+    """TensorBoard's writer, or None with a message where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        _logger.warning("no TensorBoard files, because it is not installed (%s)", error)
+        return None
+    return SummaryWriter(str(folder), purge_step=from_step + 1)
