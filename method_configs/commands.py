@@ -21,7 +21,9 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.evaluation_command import Rooms
 from method_configs.methods_benchmark import Methods
+from method_configs.scaling_evaluation import Scaling
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -173,34 +175,12 @@ def bench(
 
 def evaluate(
     *,
-    model: Path | None = None,
-    rooms: int = 20,
-    views: int = 16,
-    known: int = 8,
-    family: Literal["narrow", "medium", "wide"] = "narrow",
-    guidance: tuple[float, ...] = (),
-    seed: int = 0,
-    json: Path | None = None,
-    sheet: Path | None = None,
+    evaluation: tyro.conf.OmitArgPrefixes[
+        Annotated[Rooms, tyro.conf.subcommand("rooms")] | Annotated[Scaling, tyro.conf.subcommand("scaling")]
+    ],
 ) -> None:
-    """Complete unseen rooms and compare with the nearest known view and with the mean colour.
-
-    Args:
-        model: Model folder; by default the bundled one.
-        rooms: Unseen rooms.
-        views: Views per room.
-        known: How many of them the model is given.
-        family: How varied room and cameras are; the bundled model knows narrow rooms.
-        guidance: Guidance scales of unknown content to try; by default the model's own.
-        seed: Decides rooms, cameras and samples.
-        json: Write all measurements to this file.
-        sheet: Draw the first rooms into this PNG.
-    """
-    from method_configs import evaluation_command
-
-    evaluation_command.evaluate(
-        model=model, rooms=rooms, views=views, known=known, family=family, guidance=guidance, seed=seed, json=json, sheet=sheet
-    )
+    """Measure how good a model is on unseen rooms."""
+    evaluation.run()
 
 
 def check(*, mend: bool = False) -> None:

@@ -238,6 +238,7 @@ def test_check_runs():
 
 
 def test_eval_in_miniature(tmp_path):
+    from fb_core.evaluation.completion import METHODS
     from tiny_models import save_tiny_model
 
     arguments = [
@@ -253,7 +254,7 @@ def test_eval_in_miniature(tmp_path):
         "1",
         "2",
     ]
-    commands.main(["eval", *arguments, "--json", str(tmp_path / "eval.json"), "--sheet", str(tmp_path / "sheet.png")])
+    commands.main(["eval", "rooms", *arguments, "--json", str(tmp_path / "eval.json"), "--sheet", str(tmp_path / "sheet.png")])
     rows = json.loads((tmp_path / "eval.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == ["model", "nearest", "mean"] * 2 and [row["guidance"] for row in rows[::3]] == [1.0, 2.0]
+    assert [row["method"] for row in rows] == [*METHODS] * 2 and [row["guidance"] for row in rows[::5]] == [1.0, 2.0]
     assert (tmp_path / "sheet.png").stat().st_size > 1000

@@ -100,10 +100,10 @@ def baselines(given: RoomViews, hidden: Pinholes) -> dict[str, Float[Tensor, "m 
 
 
 def complete_hidden(
-    model: Fillerbuster, given: RoomViews, hidden: RoomViews, sampling: SamplingConfig, *, seed: int
+    model: Fillerbuster, given: RoomViews, hidden: Pinholes, sampling: SamplingConfig, *, seed: int
 ) -> Float[Tensor, "m 3 h w"]:
     """The hidden views as the model generates them in one sequence with the given ones."""
-    views = Views.cat([Views.known(given.images, given.cameras), Views.unknown(hidden.cameras)])
+    views = Views.cat([Views.known(given.images, given.cameras), Views.unknown(hidden)])
     completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling)
     return completed.images[len(given.images) :]
 
@@ -119,7 +119,7 @@ def evaluate_completion(
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)
         given, hidden = room[: task.known], room[task.known :]
-        completed = complete_hidden(model, given, hidden, sampling, seed=task.seed + number)
+        completed = complete_hidden(model, given, hidden.cameras, sampling, seed=task.seed + number)
         answers = baselines(given, hidden.cameras) | {"model": completed}
         errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in METHODS}
         yield RoomResult(truth=room.images, completed=torch.cat([given.images, completed]), psnr=errors)
