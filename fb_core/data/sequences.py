@@ -1,12 +1,13 @@
-"""Training sequences from procedural rooms: a pool of rendered rooms that is renewed while training goes on.
+"""Training sequences from scenes that are rendered while training goes on: a pool that is renewed, and the pool of procedural rooms.
 
-Everything is a function of (seed, step, row): the rooms that are in the pool, the views of each sequence, masks and frames. Processes that
-share a batch each draw rows of their own, ``range(part, batch, parts)``, and render only the rooms that these rows can draw from.
+Everything is a function of (seed, step, row): the scenes that are in the pool, the views of each sequence, masks and frames. Processes that
+share a batch each draw rows of their own, ``range(part, batch, parts)``, and render only the scenes that these rows can draw from.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,13 +19,14 @@ from torch import Tensor
 from fb_core.data.ray_caster import render_batch
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, make_room
+from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, training_frame
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
-from fb_core.masks import drop_conditioning, partly_known
 
-_ROOMS_AT_ONCE = 8  # rendered together
-Draw = Callable[[int], torch.Generator]
-"""The generator, on the CPU, of a row of the batch."""
+Encode = Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n 16 lh lw"]]
+"""The image autoencoder's encoder."""
+
+_SCENES_AT_ONCE = 8  # rendered together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,106 +56,64 @@ class PoolConfig:
             raise ValueError(f"image size: expected a multiple of 16 of at least 16, got {self.image_size}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sequences:
-    """A batch of b sequences of n posed views, all in canonical frames."""
-
-    images: Float[Tensor, "b n 3 h w"]
-    """RGB in [0, 1]."""
-    raymaps: Float[Tensor, "b n 6 h w"]
-    """Canonical raymaps: origins in [-1, 1]^3, unit directions."""
-    image_known: Float[Tensor, "b n 1 h w"]
-    """What the network is told of the images (1 = known)."""
-    rays_known: Float[Tensor, "b n 1 h w"]
-    """What the network is told of the rays (1 = known)."""
-    image_latents: Float[Tensor, "b n 16 lh lw"] | None = None
-    """Latents of the whole images where the pool keeps them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskConfig:
-    """How views become a training task (paper, appendix "Training recipe")."""
-
-    views: int = 12
-    """Views per sequence."""
-    known_share: tuple[float, float] = (0.25, 0.75)
-    """Range of the share of views whose image is known."""
-    partial_share: float = 0.15
-    """Odds that a view that would be known or unknown is partly known instead."""
-    ray_task: float = 0.25
-    """Odds that rays are to be recovered from images instead of images from rays (paper: 0.25)."""
-    dropout: float = 0.1
-    """Odds that conditioning is dropped: images, rays or both (paper: 0.1)."""
-    random_heading: bool = True
-    """Turn the canonical frame by a random heading (paper); off, the heading is 0 as in inference."""
-    random_fill: bool = True
-    """Rescale small scenes at random (paper); off, they fill the cube as in inference."""
-
-
-class RoomPool:
-    """Rendered rooms, renewed step by step."""
+class ViewPool(ABC):
+    """Rendered scenes of some square views each, renewed step by step."""
 
     def __init__(
         self,
-        config: PoolConfig,
+        scenes: int,
+        views: int,
+        image_size: int,
+        renewed_per_step: float,
         *,
-        seed: int,
         device: torch.device | str = "cpu",
-        encode: Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n 16 lh lw"]] | None = None,
+        encode: Encode | None = None,
         with_images: bool = True,
     ):
         """With ``encode`` (the frozen image autoencoder) the latents of every view are kept, so that they are made once.
 
         Without images (black ones stand in) nothing is rendered: enough for the raymap autoencoder.
         """
-        self._with_images = with_images
-        self.config, self.seed, self.device, self._encode = config, seed, torch.device(device), encode
-        self._latents: list[Tensor | None] = [None] * config.rooms
-        shape = (config.rooms, config.views, 3, config.image_size, config.image_size)
-        self._images = torch.zeros(shape, dtype=torch.uint8, device=self.device)
-        self._cameras: list[Pinholes | None] = [None] * config.rooms
-        self._ids = [-1] * config.rooms
+        self.scenes, self.views, self.image_size, self.renewed_per_step = scenes, views, image_size, renewed_per_step
+        self.with_images, self.device, self._encode = with_images, torch.device(device), encode
+        self._latents: list[Tensor | None] = [None] * scenes
+        self._images = torch.zeros((scenes, views, 3, image_size, image_size), dtype=torch.uint8, device=self.device)
+        self._cameras: list[Pinholes | None] = [None] * scenes
+        self._ids = [-1] * scenes
+
+    @abstractmethod
+    def render(self, numbers: list[int]) -> list[tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]]:
+        """The cameras of some scenes, counted from the beginning of the training, and what they see (None without images)."""
 
     def slots(self, row: int, batch: int) -> range:
-        """Places in the pool that row ``row`` of a batch draws from: every g-th, g being the greatest common divisor of batch and rooms.
+        """Places in the pool that row ``row`` of a batch draws from: every g-th, g being the greatest common divisor of batch and scenes.
 
-        So n processes that share a batch render an n-th of the rooms each (where n divides g), and draw what one alone would draw.
+        So n processes that share a batch render an n-th of the scenes each (where n divides g), and draw what one alone would draw.
         """
-        stride = math.gcd(self.config.rooms, batch)
-        return range(row % stride, self.config.rooms, stride)
+        stride = math.gcd(self.scenes, batch)
+        return range(row % stride, self.scenes, stride)
 
-    def advance(self, step: int, rows: range | None = None, on_room: Callable[[int, int], None] | None = None) -> None:
-        """Bring the pool to its state at ``step``: rooms number [k, k + rooms) with k = floor(step * renewed_per_step).
+    def advance(self, step: int, rows: range | None = None) -> None:
+        """Bring the pool to its state at ``step``: scenes number [k, k + scenes) with k = floor(step * renewed_per_step).
 
         With ``rows`` only those that these rows draw from.
         """
-        first = math.floor(step * self.config.renewed_per_step)
-        todo = [room for room in range(first, first + self.config.rooms) if self._ids[room % self.config.rooms] != room]
+        first = math.floor(step * self.renewed_per_step)
+        todo = [scene for scene in range(first, first + self.scenes) if self._ids[scene % self.scenes] != scene]
         if rows is not None:
-            stride = math.gcd(self.config.rooms, rows.stop)
+            stride = math.gcd(self.scenes, rows.stop)
             mine = {row % stride for row in rows}
-            todo = [room for room in todo if room % self.config.rooms % stride in mine]
-        for start in range(0, len(todo), _ROOMS_AT_ONCE):
-            self._render(todo[start : start + _ROOMS_AT_ONCE])
-            if on_room is not None:
-                on_room(min(start + _ROOMS_AT_ONCE, len(todo)), len(todo))
+            todo = [scene for scene in todo if scene % self.scenes % stride in mine]
+        for start in range(0, len(todo), _SCENES_AT_ONCE):
+            numbers = todo[start : start + _SCENES_AT_ONCE]
+            for number, (cameras, images) in zip(numbers, self.render(numbers), strict=True):
+                self._keep(number, cameras, images)
 
-    def _render(self, numbers: list[int]) -> None:
-        config = self.config
-        rooms, cameras = [], []
-        for number in numbers:
-            family = config.families[min(number // config.family_rooms, len(config.families) - 1)]
-            room = make_room(self.seed * 1_000_003 + number, FAMILIES[family])
-            generator = torch.Generator().manual_seed(self.seed * 7_000_003 + number)
-            cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))
-            rooms.append(room.to(self.device))
-            self._cameras[number % config.rooms], self._ids[number % config.rooms] = cameras[-1], number
-        if not self._with_images:
-            return
-        rendered = render_batch(rooms, [group.to(self.device) for group in cameras], supersample=config.supersample)
-        for number, images in zip(numbers, rendered, strict=True):
-            slot = number % config.rooms
-            self._images[slot] = (images.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+    def _keep(self, number: int, cameras: Pinholes, images: Tensor | None) -> None:
+        slot = number % self.scenes
+        self._cameras[slot], self._ids[slot] = cameras, number
+        if images is not None:
+            self._images[slot] = (images.clamp(0, 1) * 255).round().to(torch.uint8)
             if self._encode is not None:
                 self._latents[slot] = self._encode(self._images[slot].float() / 255)
 
@@ -163,7 +123,7 @@ class RoomPool:
 
     def _image(self, slots: range, generator: torch.Generator) -> Float[Tensor, "3 h w"]:
         slot = slots[int(torch.randint(len(slots), (), generator=generator))]
-        return self._images[slot, int(torch.randint(self.config.views, (), generator=generator))].float() / 255
+        return self._images[slot, int(torch.randint(self.views, (), generator=generator))].float() / 255
 
     def raymaps(self, rows: range, task: TaskConfig, draw: Draw) -> Float[Tensor, "b 6 h w"]:
         """A random view's raymap for each of these rows of a batch, in the frame of the sequence that the view would be part of."""
@@ -171,25 +131,21 @@ class RoomPool:
 
     def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
         """Training sequences for these rows of a batch."""
-        parts = [self._sequence(task, self.slots(row, rows.stop), draw(row)) for row in rows]
-        return Sequences(**{name: torch.stack([part[name] for part in parts]) for name in parts[0]})
+        return stacked([self._sequence(task, self.slots(row, rows.stop), draw(row)) for row in rows])
 
     def _frame(self, task: TaskConfig, slots: range, generator: torch.Generator) -> _Framed:
         slot = slots[int(torch.randint(len(slots), (), generator=generator))]
-        chosen = torch.randperm(self.config.views, generator=generator)[: task.views]
+        chosen = torch.randperm(self.views, generator=generator)[: task.views]
         cameras = self._cameras[slot]
         assert cameras is not None, "advance() renders the pool before sequences are drawn"
         cameras = cameras[chosen].to(self.device)
-        turn, fill = torch.rand(2, generator=generator).tolist()
-        frame = CanonicalFrame.of(
-            cameras, heading_radians=2 * math.pi * turn if task.random_heading else 0.0, fill=fill if task.random_fill else 1.0
-        )
+        frame = training_frame(cameras, task, generator=generator)
         return _Framed(slot, chosen.to(self.device), cameras, frame)
 
     def _sequence(self, task: TaskConfig, slots: range, generator: torch.Generator) -> dict[str, Tensor]:
         framed = self._frame(task, slots, generator)
         slot, chosen = framed.slot, framed.chosen
-        image_known, rays_known = draw_task(len(chosen), self.config.image_size, task, generator=generator)
+        image_known, rays_known = draw_task(len(chosen), self.image_size, task, generator=generator)
         latents = self._latents[slot]
         kept = {} if latents is None else {"image_latents": latents[chosen]}
         return kept | {
@@ -201,7 +157,7 @@ class RoomPool:
 
 
 class _Framed(NamedTuple):
-    """Views of one room in a canonical frame."""
+    """Views of one scene in a canonical frame."""
 
     slot: int
     chosen: Tensor
@@ -213,21 +169,28 @@ class _Framed(NamedTuple):
         return self.frame.apply(raymaps_of(self.cameras)) if view is None else self.frame.apply(raymaps_of(self.cameras[[view]]))[0]
 
 
-def draw_task(count: int, size: int, task: TaskConfig, *, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """(image mask, ray mask), each [n, 1, size, size]: one modality is to be completed, the other is known, or dropped.
+class RoomPool(ViewPool):
+    """Procedural rooms, rendered on the training's device."""
 
-    The first view is the frame's reference; it stays known whenever any view is, as in inference.
-    """
-    low, high = task.known_share
-    share = low + (high - low) * float(torch.rand((), generator=generator))
-    known = min(count, max(1, round(share * count)))
-    masks = torch.zeros(count, 1, size, size)
-    masks[:known] = 1.0
-    partial = torch.rand(count, generator=generator) < task.partial_share
-    for view in partial.nonzero()[:, 0].tolist():
-        masks[view] = partly_known(size, size, generator=generator)
-    everything = torch.ones_like(masks)
-    is_ray_task = float(torch.rand((), generator=generator)) < task.ray_task
-    image_known, rays_known = (everything, masks) if is_ray_task else (masks, everything)
-    drop_images, drop_rays = drop_conditioning(generator, share=task.dropout)
-    return image_known * (not drop_images), rays_known * (not drop_rays)
+    def __init__(
+        self, config: PoolConfig, *, seed: int, device: torch.device | str = "cpu", encode: Encode | None = None, with_images: bool = True
+    ):
+        super().__init__(
+            config.rooms, config.views, config.image_size, config.renewed_per_step, device=device, encode=encode, with_images=with_images
+        )
+        self.config, self.seed = config, seed
+
+    def render(self, numbers: list[int]) -> list[tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]]:
+        """Rooms of the families that the curriculum has for these numbers."""
+        config = self.config
+        rooms, cameras = [], []
+        for number in numbers:
+            family = config.families[min(number // config.family_rooms, len(config.families) - 1)]
+            room = make_room(self.seed * 1_000_003 + number, FAMILIES[family])
+            generator = torch.Generator().manual_seed(self.seed * 7_000_003 + number)
+            cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))
+            rooms.append(room.to(self.device))
+        if not self.with_images:
+            return [(group, None) for group in cameras]
+        rendered = render_batch(rooms, [group.to(self.device) for group in cameras], supersample=config.supersample)
+        return [(group, images.rgb) for group, images in zip(cameras, rendered, strict=True)]

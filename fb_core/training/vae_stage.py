@@ -42,7 +42,7 @@ class VAEStage(Stage):
         self.network: VAE = network
         self.pool, self.config, self.seed = pool, config, seed
         # Raymaps are seen under every heading and scale: the autoencoder must not know the frame.
-        self._task = TaskConfig(views=min(4, pool.config.views), random_heading=True, random_fill=True)
+        self._task = TaskConfig(views=min(4, pool.views), random_heading=True, random_fill=True)
 
     @property
     def batch(self) -> int:
