@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -69,6 +69,7 @@ class TaskConfig:
     """Rescale small scenes at random (paper); off, they fill the cube as in inference."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Where training data come from. ``rows`` are numbers of rows of a batch of ``rows.stop`` rows."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,14 +12,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit
-from fb_core.data.sequences import RoomPool, Sequences, TaskConfig
-from fb_core.flow import at_time, logit_normal_times, masked_loss, velocity
+from fb_core.data.training_task import Sequences, Source, TaskConfig
+from fb_core.flow import at_time, logit_normal_times, velocity
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.masks import to_latent_grid
 from fb_core.networks.dit import DiT
 from fb_core.networks.embeddings import index_positions
 from fb_core.networks.vae import VAE
 from fb_core.training.loop import Stage, row_generator
+
+EncodeText = Callable[[list[str]], Float[Tensor, "b words t"]]
+"""Embeddings of texts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +49,12 @@ class Drawn:
     """Positions of the views."""
     velocity: Float[Tensor, "b n 32 h w"]
     """Noise minus data."""
+    image_weight: Float[Tensor, "b n 1 h w"] | None = None
+    """1 where the image's latent has ground truth, else 0; None = everywhere."""
+    rays_weight: Float[Tensor, "b n 1 h w"] | None = None
+    """The same of the raymap's latent."""
+    text: Float[Tensor, "b words t"] | None = None
+    """Embeddings of the captions, for networks that read text."""
 
 
 class DiTStage(Stage):
@@ -52,14 +62,32 @@ class DiTStage(Stage):
 
     name = "dit"
 
-    def __init__(self, network: DiT, *, image_vae: VAE, raymap_vae: VAE, pool: RoomPool, config: DiTLossConfig, seed: int):
+    def __init__(
+        self,
+        network: DiT,
+        *,
+        image_vae: VAE,
+        raymap_vae: VAE,
+        pool: Source,
+        config: DiTLossConfig,
+        seed: int,
+        encode_text: EncodeText | None = None,
+    ):
+        """Raises ValueError for a network that reads text without ``encode_text`` (``TextEncoder.encode``)."""
+        if network.config.text_width and encode_text is None:
+            raise ValueError(
+                "dit: this transformer reads text, so training needs a folder with the CLIP text model (a clone of "
+                "openai/clip-vit-large-patch14); give one, or choose a preset without text"
+            )
         self.network: DiT = network
         self.image_vae, self.raymap_vae = (vae.eval().requires_grad_(False) for vae in (image_vae, raymap_vae))
         self.pool, self.config, self.seed = pool, config, seed
+        self._encode_text = encode_text if network.config.text_width else None
+        self._empty_prompt: Tensor | None = None
 
     @property
     def batch(self) -> int:
-        """Sequences per step."""
+        """Sequences per step (a row of single images holds several)."""
         return self.config.batch
 
     @torch.no_grad()
@@ -69,18 +97,52 @@ class DiTStage(Stage):
         sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
         data, conditioning = encode_sequences(sequences, image_vae=self.image_vae, raymap_vae=self.raymap_vae)
         generators = [row_generator(self.seed, step, row, 1) for row in rows]
-        times = torch.cat([logit_normal_times(1, generator=generator) for generator in generators]).to(data.device)
-        noise = torch.stack([torch.randn(data.shape[1:], generator=generator) for generator in generators]).to(data)
-        mode, views = self.network.config.index, data.shape[1]
-        index = torch.cat([index_positions(mode, 1, views, generator=generator) for generator in generators]).to(data.device)
-        inputs = join(at_time(data, noise, times), conditioning)
-        return Drawn(inputs=inputs, times=times, index=index, velocity=velocity(data, noise))
+        mode, (count, views, *latent) = self.network.config.index, data.shape
+        each = count // len(rows)
+        times = torch.cat([logit_normal_times(each, generator=generator) for generator in generators]).to(data.device)
+        noise = torch.cat([torch.randn(each, views, *latent, generator=generator) for generator in generators]).to(data)
+        index = torch.cat([index_positions(mode, each, views, generator=generator) for generator in generators]).to(data.device)
+        return Drawn(
+            inputs=join(at_time(data, noise, times), conditioning),
+            times=times,
+            index=index,
+            velocity=velocity(data, noise),
+            image_weight=_latent_weight(sequences.image_truth),
+            rays_weight=_latent_weight(sequences.rays_truth),
+            text=self._text(sequences.captions, count, data.device),
+        )
+
+    def _text(self, captions: tuple[str, ...] | None, count: int, device: torch.device) -> Float[Tensor, "b words t"] | None:
+        if self._encode_text is None:
+            return None
+        if captions is not None:
+            return self._encode_text(list(captions)).to(device)
+        if self._empty_prompt is None:
+            self._empty_prompt = self._encode_text([""]).to(device)
+        return self._empty_prompt.expand(count, -1, -1)
 
     def losses(self, drawn: Drawn) -> dict[str, Tensor]:
         """Velocity errors of both modalities and their weighted sum."""
-        predicted = self.network(drawn.inputs, drawn.times, None, drawn.index)
-        image_error, ray_error = (masked_loss(got, wanted) for got, wanted in zip(split(predicted), split(drawn.velocity), strict=True))
+        predicted = self.network(drawn.inputs, drawn.times, drawn.text, drawn.index)
+        image_error, ray_error = (
+            _mean_error(got, wanted, weight)
+            for got, wanted, weight in zip(split(predicted), split(drawn.velocity), (drawn.image_weight, drawn.rays_weight), strict=True)
+        )
         return {"loss": image_error + self.config.ray_weight * ray_error, "image": image_error, "rays": ray_error}
+
+
+def _mean_error(predicted: Tensor, wanted: Tensor, weight: Tensor | None) -> Float[Tensor, ""]:
+    """Mean squared error, 0 where there is no ground truth. The mean is over all positions: so parts of a batch add up to the whole."""
+    error = (predicted - wanted).square()
+    return error.mean() if weight is None else (error * weight).mean()
+
+
+def _latent_weight(truth: Float[Tensor, "b n 1 h w"] | None) -> Float[Tensor, "b n 1 lh lw"] | None:
+    """1 for latent cells whose pixels all have ground truth."""
+    if truth is None:
+        return None
+    whole = (to_latent_grid(truth.flatten(0, 1)) > 1 - 1e-4).float()
+    return rearrange(whole, "(b n) c h w -> b n c h w", b=len(truth))
 
 
 @torch.no_grad()

@@ -1,17 +1,19 @@
-"""Training of the two autoencoders: L1 reconstruction and a small KL term (paper, appendix "Loss and guidance weights")."""
+"""Training of the autoencoders: L1, a small KL term, and judges of how real it looks (paper, appendix "Loss and guidance weights")."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from fb_core.data.sequences import RoomPool, TaskConfig
+from fb_core.data.training_task import Source, TaskConfig
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.networks.vae import VAE
+from fb_core.training.adversarial import PatchDiscriminator, discriminator_loss, generator_loss
 from fb_core.training.loop import Stage, row_generator
 
 
@@ -25,6 +27,14 @@ class VAELossConfig:
     """Weight of the mean absolute error (values in [-1, 1], as the network sees them)."""
     kl: float = 1e-6
     """Weight of the KL divergence, summed over a latent's entries and averaged over the batch (paper: 1e-6)."""
+    adversarial: float = 0.0
+    """Weight of the adversarial term (paper: 0.5); 0 for none, and no discriminator."""
+    adversarial_from: int = 0
+    """Step from which the autoencoder feels it; the discriminator learns from the first step on."""
+    perceptual: float = 0.0
+    """Weight of LPIPS, where its weights are at hand; images only."""
+    frame: Literal["upright", "random"] = "upright"
+    """Frames of the raymaps."""
 
 
 def kl_divergence(mean: Float[Tensor, "b c h w"], logvar: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:
@@ -32,17 +42,34 @@ def kl_divergence(mean: Float[Tensor, "b c h w"], logvar: Float[Tensor, "b c h w
     return 0.5 * (mean.square() + logvar.exp() - 1 - logvar).flatten(1).sum(dim=1).mean()
 
 
-class VAEStage(Stage):
-    """Trains one autoencoder on images or on raymaps of a pool of rooms."""
+@dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """What an autoencoder is given for some rows of a batch."""
 
-    def __init__(self, network: VAE, pool: RoomPool, *, kind: str, config: VAELossConfig, seed: int):
+    values: Float[Tensor, "b c h w"]
+    """Images or raymaps in [0, 1]."""
+    noise: Float[Tensor, "b z lh lw"]
+    """Standard normal; makes a sample of the posterior."""
+    step: int
+    """The step that they belong to."""
+
+
+class VAEStage(Stage):
+    """Trains one autoencoder on images or on raymaps of a source."""
+
+    def __init__(self, network: VAE, pool: Source, *, kind: str, config: VAELossConfig, seed: int, perceptual: nn.Module | None = None):
+        """``perceptual`` is LPIPS of images in [0, 1] (``fb_core.training.perceptual``); without it that term is left out."""
         if kind not in ("image-vae", "raymap-vae"):
             raise ValueError(f"autoencoder: expected 'image-vae' or 'raymap-vae', got {kind!r}")
         self.name: str = kind
         self.network: VAE = network
         self.pool, self.config, self.seed = pool, config, seed
+        self._perceptual = perceptual if config.perceptual and kind == "image-vae" else None
+        if config.adversarial:
+            critic = PatchDiscriminator(network.config.in_channels).initialize(torch.Generator().manual_seed(seed))
+            self.critic = critic.to(next(network.parameters()).device)
         # Raymaps are seen under every heading and scale: the autoencoder must not know the frame.
-        self._task = TaskConfig(views=min(4, pool.views), random_heading=True, random_fill=True)
+        self._task = TaskConfig(views=min(4, pool.views), frame=config.frame, random_heading=True, random_fill=True)
 
     @property
     def batch(self) -> int:
@@ -56,24 +83,34 @@ class VAEStage(Stage):
             return self.pool.images(rows, draw)
         return to_unit_range(self.pool.raymaps(rows, self._task, draw))
 
-    def draw(self, step: int, rows: range) -> tuple[Tensor, Tensor]:
-        """(values in [0, 1], standard normal noise of their latents)."""
+    def draw(self, step: int, rows: range) -> Pictures:
+        """Images or raymaps of these rows of a step's batch; a row's noise depends on (seed, step, row) too."""
         self.pool.advance(step, rows)
-        target = self.values(step, rows)
-        config = self.network.config
-        shape = config.latent_channels, target.shape[-2] // config.factor, target.shape[-1] // config.factor
-        noise = torch.stack([torch.randn(shape, generator=row_generator(self.seed, step, row, 1)) for row in rows])
-        return target, noise.to(target)
+        values = self.values(step, rows)
+        config, each = self.network.config, len(values) // len(rows)
+        shape = each, config.latent_channels, values.shape[-2] // config.factor, values.shape[-1] // config.factor
+        noise = torch.cat([torch.randn(shape, generator=row_generator(self.seed, step, row, 1)) for row in rows])
+        return Pictures(values=values, noise=noise.to(values), step=step)
 
-    def losses(self, drawn: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """L1, KL and their weighted sum."""
-        target, noise = drawn
+    def losses(self, drawn: Pictures) -> dict[str, Tensor]:
+        """The terms, and their weighted sum. The discriminator's own loss is part of the sum; neither network feels the other's."""
+        config, target = self.config, drawn.values
         mean, logvar = self.network.posterior(target)
-        latent = mean + (0.5 * logvar).exp() * noise
+        latent = mean + (0.5 * logvar).exp() * drawn.noise
         reconstruction = self.network.decode(latent * self.network.config.scaling, clamp=False)
         l1 = 2 * (reconstruction - target).abs().mean()  # in the network's own range [-1, 1]
         kl = kl_divergence(mean, logvar)
-        return {"loss": self.config.l1 * l1 + self.config.kl * kl, "l1": l1, "kl": kl}
+        terms = {"l1": l1, "kl": kl}
+        loss = config.l1 * l1 + config.kl * kl
+        if self._perceptual is not None:
+            terms["lpips"] = self._perceptual(reconstruction, target, normalize=True).mean()
+            loss = loss + config.perceptual * terms["lpips"]
+        if self.critic is not None:
+            real, fake = 2 * target - 1, 2 * reconstruction - 1
+            terms["critic"] = discriminator_loss(self.critic, real, fake)
+            terms["adversarial"] = generator_loss(self.critic, fake) if drawn.step >= config.adversarial_from else torch.zeros_like(l1)
+            loss = loss + terms["critic"] + config.adversarial * terms["adversarial"]
+        return {"loss": loss, **terms}
 
 
 @torch.no_grad()
