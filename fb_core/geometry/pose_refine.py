@@ -11,7 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.pose_centers import median_over
@@ -28,6 +28,25 @@ _RIDGE = 1e-14  # of the mean diagonal: keeps undetermined parameters where they
 
 
 @dataclass(frozen=True, kw_only=True)
+class FocalPrior:
+    """Focal lengths that somebody tells, such as a photo's EXIF data, as normal laws of their logarithms."""
+
+    focal: Float[Tensor, " n"]
+    """Pixels; NaN where nobody tells."""
+    deviation: float
+    """Standard deviation of the logarithm."""
+
+    @property
+    def told(self) -> Bool[Tensor, " n"]:
+        """Whose focal length is told."""
+        return torch.isfinite(self.focal)
+
+    def off(self, fit: Fit) -> Float[Tensor, "n 2"]:
+        """Logarithms of fx, fy against what is told; 0 where nothing is."""
+        return torch.where(self.told[:, None], fit.focal.log() - torch.where(self.told, self.focal, 1.0).log()[:, None], 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Model:
     """Which parameters there are."""
 
@@ -37,6 +56,8 @@ class Model:
     """fx = fy."""
     free_principal: bool
     """Principal points are looked for, each view's own."""
+    prior: FocalPrior | None = None
+    """What is known of focal lengths beforehand."""
 
     @property
     def local(self) -> int:
@@ -82,6 +103,8 @@ def refine(fit: Fit, rays: Rays, model: Model) -> Refined:
     the curvature of the residuals, which vanishes with them).
     """
     fixed = dataclasses.replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
+    if model.prior is not None:
+        fit = dataclasses.replace(fit, focal=torch.where(model.prior.told[:, None], model.prior.focal[:, None], fit.focal))
     if model.shared_focal or model.square_pixels:
         fit = dataclasses.replace(fit, focal=_tied(fit.focal, rays.weights.sum(dim=1), model))
     fit, hessian = _softly(fit, fixed.leading(_SOFT_RAYS), model)
@@ -167,7 +190,29 @@ def _normal_equations(
     rows += [miss[:, i] for i in range(3)]
     jacobian = torch.stack(rows, dim=1).unflatten(1, (-1, 3))
     products = (jacobian * kept[:, None, None]).flatten(2) @ jacobian.flatten(2).transpose(1, 2)
-    return products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+    hessian, gradient, cost = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+    return (hessian, gradient, cost) if model.prior is None else _with_prior(fit, hessian, gradient, cost, model, model.prior)
+
+
+def _with_prior(
+    fit: Fit,
+    hessian: Float[Tensor, "n p p"],
+    gradient: Float[Tensor, "n p"],
+    cost: Float[Tensor, " n"],
+    model: Model,
+    prior: FocalPrior,
+) -> tuple[Float[Tensor, "n p p"], Float[Tensor, "n p"], Float[Tensor, " n"]]:
+    """The same with what is told of focal lengths. Views that share one tell one thing, not each its own."""
+    information = prior.told.to(cost) / prior.deviation**2 / (prior.told.sum().clamp_min(1) if model.shared_focal else 1)
+    off = prior.off(fit)
+    off = off[:, :1] if model.square_pixels else off
+    zeros = torch.zeros_like(gradient[:, : model.local])
+    told = information[:, None] * torch.cat([zeros, torch.ones_like(off)], dim=1)
+    return (
+        hessian + torch.diag_embed(told),
+        gradient + torch.cat([zeros, information[:, None] * off], dim=1),
+        cost + information * off.square().sum(dim=1),
+    )
 
 
 def _step(

@@ -19,7 +19,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.pose_centers import Centers, robust_centers
 from fb_core.geometry.pose_inliers import Limits, agreeing_rays, homography_of
 from fb_core.geometry.pose_rays import Rays, rays_of, rays_of_raymaps, sound_rays
-from fb_core.geometry.pose_refine import Fit, Model, Refined, refine
+from fb_core.geometry.pose_refine import Fit, FocalPrior, Model, Refined, refine
 from fb_core.geometry.pose_seed import camera_of, seeds_of
 from fb_core.geometry.pose_verdict import Arrangement, Judgement, Verdict, arrangement_of, judge_seeds, judge_share
 
@@ -32,6 +32,8 @@ class PoseSolving:
     """Whether all views have one focal length (pictures of one camera, one zoom)."""
     square_pixels: bool = False
     """Whether fx = fy."""
+    focal_deviation: float = 0.01
+    """Relative standard deviation of focal lengths that are told; small, because the errors of raymaps' rays are not independent."""
     principal: Literal["known", "free"] = "known"
     """Whether principal points are given (the image's centre by default) or looked for."""
     rays_per_view: int = 4096
@@ -44,6 +46,8 @@ class PoseSolving:
     """Decides the random choices."""
 
     def __post_init__(self) -> None:
+        if not self.focal_deviation > 0:
+            raise ValueError(f"pose solving: expected focal_deviation above 0, got {self.focal_deviation}")
         if self.rays_per_view < 4 or self.hypotheses < 1 or not 0 <= self.least_consensus <= 1:
             raise ValueError(
                 "pose solving: expected rays_per_view of at least 4, hypotheses of at least 1 and least_consensus in [0, 1], got "
@@ -91,6 +95,7 @@ def recover_cameras(
     *,
     weights: Float[Tensor, "n 1 h w"] | None = None,
     principal: Float[Tensor, "n 2"] | None = None,
+    focal: Float[Tensor, " n"] | None = None,
     solving: PoseSolving = PoseSolving(),
 ) -> RecoveredCameras:
     """Pinhole cameras of raymaps, the inverse of :func:`fb_core.geometry.raymap.raymaps_of`; differentiable in the inlying rays.
@@ -100,6 +105,7 @@ def recover_cameras(
         weights: known-masks or inverse variances up to a factor (0 = unknown); None trusts all. Rays without weight may hold anything.
         principal: principal points in pixels of these raymaps; None is the image's centre. For a window at (left, top) of an image whose
             principal point is (cx, cy), they are (cx - left, cy - top), inside the window or not.
+        focal: focal lengths in pixels that somebody tells (EXIF data); NaN where nobody does. `solving.focal_deviation` says how sure.
         solving: what is known of the cameras, and the amount of work.
 
     Returns cameras in the raymaps' precision (float32 for half precision). Raises ValueError for arguments of disagreeing shapes and for
@@ -115,7 +121,10 @@ def recover_cameras(
     _check_weights(weights)
     sound = sound_rays(raymaps.detach())
     rays = rays_of_raymaps(raymaps, weights[:, 0], sound, at_most=solving.rays_per_view)
-    found = _recover(rays, principal, width, height, solving, dtype=_working(raymaps.dtype))
+    if focal is not None and (tuple(focal.shape) != (count,) or bool((focal <= 0).any())):
+        raise ValueError(f"focal: expected {count} positive lengths or NaN, one for each raymap, got {focal.tolist()}")
+    prior = None if focal is None else FocalPrior(focal=focal.to(rays.pixels), deviation=solving.focal_deviation)
+    found = _recover(rays, principal, width, height, solving, prior=prior, dtype=_working(raymaps.dtype))
     like = raymaps.detach().to(found.cameras.focal.dtype)
     x = torch.arange(width, device=like.device, dtype=like.dtype)[None, None] + 0.5
     y = torch.arange(height, device=like.device, dtype=like.dtype)[None, :, None] + 0.5
@@ -164,7 +173,14 @@ class _Found:
 
 
 def _recover(
-    rays: Rays, principal: Float[Tensor, "n 2"] | None, width: int, height: int, solving: PoseSolving, *, dtype: torch.dtype
+    rays: Rays,
+    principal: Float[Tensor, "n 2"] | None,
+    width: int,
+    height: int,
+    solving: PoseSolving,
+    *,
+    prior: FocalPrior | None = None,
+    dtype: torch.dtype,
 ) -> _Found:
     count = len(rays.weights)
     free = solving.principal == "free"
@@ -175,7 +191,7 @@ def _recover(
     if tuple(principal.shape) != (count, 2) or not bool(torch.isfinite(principal).all()):
         raise ValueError(f"principal: expected finite numbers of shape {(count, 2)}, got a tensor of shape {tuple(principal.shape)}")
     principal = principal.to(rays.pixels)
-    model = Model(shared_focal=solving.focal == "shared", square_pixels=solving.square_pixels, free_principal=free)
+    model = Model(shared_focal=solving.focal == "shared", square_pixels=solving.square_pixels, free_principal=free, prior=prior)
     with torch.no_grad():
         fixed = dataclasses.replace(rays, directions=rays.directions.detach(), origins=rays.origins.detach())
         seeds = seeds_of(fixed, hypotheses=solving.hypotheses, seed=solving.seed)

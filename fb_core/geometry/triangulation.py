@@ -80,7 +80,7 @@ def triangulate(photos: Sequence[Features]) -> tuple[Float[Tensor, "m 3"], Float
     ]
     if not links:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    track = _tracks(torch.cat(links), int(starts[-1]))
+    track = tracks_of(torch.cat(links), int(starts[-1]))
     owner = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(photo) for photo in photos]))
     members = track >= 0
     track, owner = track[members], owner[members]
@@ -100,17 +100,26 @@ def matches(first: Features, second: Features) -> tuple[Int[Tensor, " m"], Int[T
     # The angle between a ray and the plane through the baseline and the other photo's ray.
     normals = F.normalize(torch.linalg.cross(baseline.expand_as(first.directions), first.directions), dim=-1, eps=1e-12)
     near = (normals @ second.directions.T).abs() < np.sin(np.radians(_EPIPOLAR_DEGREES))
-    similar = torch.where(near, first.descriptors @ second.descriptors.T, -1.0)
+    return mutual_matches(torch.where(near, first.descriptors @ second.descriptors.T, -1.0), ratio=_RATIO)
+
+
+def mutual_matches(similar: Float[Tensor, "k l"], *, ratio: float) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """Rows and columns that are each other's best match, the next best farther off by Lowe's ratio (cosines of unit descriptors)."""
     best, partner = similar.topk(2, dim=1)
     back = similar.argmax(dim=0)
-    mutual = back[partner[:, 0]] == torch.arange(len(first))
+    mutual = back[partner[:, 0]] == torch.arange(len(similar))
     distance = (2 - 2 * best).clamp(min=0).sqrt()
-    chosen = mutual & (best[:, 0] > _LEAST_SIMILARITY) & (distance[:, 0] < _RATIO * distance[:, 1])
+    chosen = mutual & (best[:, 0] > _LEAST_SIMILARITY) & (distance[:, 0] < ratio * distance[:, 1])
     return chosen.nonzero()[:, 0], partner[chosen, 0]
 
 
 def nearest_points(
-    centers: Float[Tensor, "k 3"], directions: Float[Tensor, "k 3"], track: Int[Tensor, " k"]
+    centers: Float[Tensor, "k 3"],
+    directions: Float[Tensor, "k 3"],
+    track: Int[Tensor, " k"],
+    *,
+    least_angle_degrees: float = _LEAST_ANGLE_DEGREES,
+    most_error_degrees: float = _MOST_ERROR_DEGREES,
 ) -> tuple[Float[Tensor, "m 3"], Tensor]:
     """The point nearest to the rays of each track (least squares of the distances), and whether it can be trusted.
 
@@ -120,6 +129,8 @@ def nearest_points(
         centers: ray origins, world.
         directions: unit ray directions, world.
         track: which track a ray belongs to, 0 to m - 1, each with at least one ray.
+        least_angle_degrees: between the rays of a trusted track.
+        most_error_degrees: between any ray of a trusted track and its point.
     """
     count = int(track.max()) + 1 if len(track) else 0
     across = torch.eye(3).to(directions) - directions[:, :, None] * directions[:, None, :]
@@ -130,11 +141,11 @@ def nearest_points(
     offset = points[track] - centers
     looks = F.normalize(offset, dim=-1, eps=1e-30)
     error = torch.linalg.cross(looks, directions).norm(dim=-1)
-    bad = ((looks * directions).sum(dim=-1) <= 0) | (error > np.sin(np.radians(_MOST_ERROR_DEGREES)))
+    bad = ((looks * directions).sum(dim=-1) <= 0) | (error > np.sin(np.radians(most_error_degrees)))
     worst = torch.zeros(count, dtype=torch.long).index_add_(0, track, bad.long())
     # |mean direction| = cos of half the angle for two rays; for more it falls with their spread.
     spread = _mean_over(directions, track, count).norm(dim=-1)
-    wide = spread < np.cos(np.radians(_LEAST_ANGLE_DEGREES) / 2)
+    wide = spread < np.cos(np.radians(least_angle_degrees) / 2)
     return points, solvable & wide & (worst == 0)
 
 
@@ -154,7 +165,7 @@ def _pairs(photos: Sequence[Features]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _tracks(links: Int[Tensor, "l 2"], count: int) -> Int[Tensor, " count"]:
+def tracks_of(links: Int[Tensor, "l 2"], count: int) -> Int[Tensor, " count"]:
     """Connected components of the links, numbered from 0; -1 for features without a link."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
