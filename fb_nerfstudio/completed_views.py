@@ -39,6 +39,8 @@ class Origin:
     """Text the pass was conditioned on; empty without one."""
     model_hash: str
     """Content hash of the diffusion weights."""
+    aspect: float = 1.0
+    """Width over height of the part of the square view that may be trained on; the rest is margin."""
 
 
 @dataclass(frozen=True, kw_only=True)

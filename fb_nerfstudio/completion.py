@@ -109,7 +109,14 @@ def run_completion(
         known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
         images = round_images(sequence, planned, model, config, cache, on_step, on_found)
-        origin = Origin(role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash)
+        origin = Origin(
+            role=planned.role,
+            round=planned.number,
+            seed=planned.seed,
+            prompt=planned.prompt,
+            model_hash=model.model_hash,
+            aspect=planned.aspect,
+        )
         views = CompletedViews(
             images=images,
             masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),

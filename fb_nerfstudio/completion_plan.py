@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.data.camera_path import read_camera_path
@@ -86,7 +86,14 @@ class CompletionPlan:
         return tuple(range(len(self.context)) if planned.context is None else map(self.context.index, planned.context))
 
 
-def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None, config: CompletionConfig, *, size: int) -> CompletionPlan:
+def plan_completion(
+    cameras: list[Pinholes],
+    points: Float[Tensor, "m 3"] | None,
+    config: CompletionConfig,
+    *,
+    size: int,
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+) -> CompletionPlan:
     """Choose context views and new cameras.
 
     Anchors stand on a cylinder of the capture's own centre, up and radius. In captures that look outward (rooms) each looks
@@ -99,11 +106,12 @@ def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None
         points: seen surface points in the same world, or None when there are none yet.
         config: numbers of views, placement, seed.
         size: side of the generated views in pixels.
+        known: of each captured picture its known part (a mask of any size, None for all of it); without, all of them are known.
     """
     cameras = [camera.to("cpu", torch.float32) for camera in cameras]
     shape = CaptureShape.of(cameras)
     points = thinned_points(points, shape)
-    site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, placement=config.placement)
+    site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, known=known, placement=config.placement)
     count = config.context_views
     context = strided_subset(len(cameras), count) if config.context_choice == "stride" else spread_subset(cameras, count)
     rounds = _placed_rounds(site, context, config, size) if config.camera_path is None else _path_rounds(config, size)
@@ -115,7 +123,7 @@ def plan_completion(cameras: list[Pinholes], points: Float[Tensor, "m 3"] | None
 
 def _with_own_context(planned: PlannedRound, context: Sequence[int], site: _Site, count: int) -> PlannedRound:
     """The round with the views that show most of what its cameras will show; anchors look everywhere and keep the common ones."""
-    near = context if planned.role == ANCHOR else nearest_context(site.cameras, planned.cameras, site.shell, count)
+    near = context if planned.role == ANCHOR else nearest_context(site.cameras, planned.cameras, site.shell, count, site.known)
     return dataclasses.replace(planned, context=tuple(near))
 
 
@@ -176,6 +184,7 @@ class _Site:
     shell: Shell
     points: Float[Tensor, "m 3"]
     cameras: list[Pinholes]
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None
     placement: PlacementConfig
 
     def surface(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
@@ -189,7 +198,8 @@ class _Site:
         People look ahead more than at floor and ceiling, and so did the cameras that the model was trained on.
         """
         surface, directions = self.surface()
-        return (1.0 - 0.6 * (directions @ self.shape.up) ** 2) * torch.where(seen_by(self.cameras, surface), _SEEN_NEED, 1.0)
+        seen = seen_by(self.cameras, surface, self.known)
+        return (1.0 - 0.6 * (directions @ self.shape.up) ** 2) * torch.where(seen, _SEEN_NEED, 1.0)
 
     def centers(self, role: str, views: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
         """Camera centres of one round, pulled out of seen geometry."""

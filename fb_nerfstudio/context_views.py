@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -17,7 +17,13 @@ _SHOWN_AGAIN = 0.35  # a surface point is worth this much less each time another
 _NEARNESS = 1e-3  # decides between captured views that show equally much
 
 
-def nearest_context(cameras: Sequence[Pinholes], targets: Pinholes, shell: Shell, count: int) -> list[int]:
+def nearest_context(
+    cameras: Sequence[Pinholes],
+    targets: Pinholes,
+    shell: Shell,
+    count: int,
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+) -> list[int]:
     """The captured views that together show most of what ``targets`` will show, the most level one first.
 
     What the targets show is guessed by rays to the shell. Views are chosen one by one; a surface point that is shown already counts
@@ -28,6 +34,7 @@ def nearest_context(cameras: Sequence[Pinholes], targets: Pinholes, shell: Shell
         targets: the new views.
         shell: the guessed surface.
         count: how many to choose; all when there are fewer.
+        known: of each captured picture its known part, None for all of it; without, all of them are known.
     """
     cameras = [camera.to("cpu", torch.float32) for camera in cameras]
     small = targets.to("cpu", torch.float32).scaled(_RAYS_ACROSS, _RAYS_ACROSS)
@@ -36,7 +43,8 @@ def nearest_context(cameras: Sequence[Pinholes], targets: Pinholes, shell: Shell
     distance = intersect(shell, origins, directions)
     met = torch.isfinite(distance)
     points = origins[met] + distance[met, None] * directions[met]
-    shown = torch.stack([seen_by([camera], points) for camera in cameras]).double()
+    masks = [None] * len(cameras) if known is None else known
+    shown = torch.stack([seen_by([camera], points, [mask]) for camera, mask in zip(cameras, masks, strict=True)]).double()
     nearness = _nearness(cameras, small)
     worth, chosen = torch.full((len(points),), 1 / max(len(points), 1), dtype=torch.float64), []
     while len(chosen) < min(count, len(cameras)):

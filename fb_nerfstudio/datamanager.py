@@ -8,6 +8,7 @@ import random
 import shutil
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,14 +33,26 @@ from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
-from fb_nerfstudio.requests import CompleteFrom, RegenerateRound, RemoveView, Request, merged, plan_request, without_view
+from fb_nerfstudio.requests import (
+    CompleteFrom,
+    RegenerateRound,
+    RemoveView,
+    Request,
+    merged,
+    place_of,
+    plan_request,
+    standing_on,
+    without_view,
+)
 from fb_nerfstudio.start_points import start_points
 from fb_nerfstudio.unseen import (
     SOLID,
     TRAINED_STEPS,
     coarse,
+    coarse_mask,
     find_unseen,
     render_geometry,
+    seen_by_nobody_else,
     surface_points,
     unseen_gaussians,
     with_matched_colors,
@@ -95,6 +108,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             refuse_bad_capture(config)
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+        self._own_points: torch.Tensor | None = None
         if test_mode == "val" and config.start_points > 0 and "points3D_xyz" not in self.train_dataparser_outputs.metadata:
             self._find_start_points()
         self.completion_panel = CompletionPanel(prompt=config.completion.prompt)  # public: nerfstudio's viewer looks for it by type
@@ -103,6 +117,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         self._bank_cameras: Cameras | None = None
         self._bank_shares: list[float] = []  # of each generated view, the share of its pixels that is trained on
         self._finished = False
+        self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
         self._captured_draws = 0
         self._epoch: tuple[int, list[int]] = (-1, [])
 
@@ -113,6 +128,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if len(points):
             metadata = self.train_dataparser_outputs.metadata
             metadata |= {"points3D_xyz": points, "points3D_rgb": (colors * 255).round().to(torch.uint8)}
+            self._own_points = points
 
     # ------------------------------------------------------------------------------------------------ training batches
 
@@ -168,10 +184,18 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         return self._bank_cameras[index : index + 1], batch
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict[str, torch.Tensor]]:
-        """As in nerfstudio; without CUDA images stay in ordinary memory, where nerfstudio would pin them and crash."""
+        """As in nerfstudio, but alpha becomes part of the mask (transparent is unknown), for training, evaluation and context alike.
+
+        Without CUDA images stay in ordinary memory, where nerfstudio would pin them and crash.
+        """
         if cache_images_device == "cpu" and torch.device(self.device).type != "cuda":
             cache_images_device = "gpu"  # means "on self.device"
-        return super()._load_images(split, cache_images_device)
+        loaded = super()._load_images(split, cache_images_device)
+        for data in loaded:
+            if data["image"].shape[-1] == 4:
+                data["mask"] = batch_known(data).movedim(0, -1) >= 0.5
+                data["image"] = data["image"][..., :3].contiguous()
+        return loaded
 
     # ------------------------------------------------------------------------------------------------------ generation
 
@@ -202,9 +226,12 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
         model, cameras = self._load_inpainter(), self._captured_cameras()
         points = self._seen_points(splats, cameras, step)
-        inpaints = config.task == "inpaint"
-        make_plan, generate = (plan_inpainting, run_inpainting) if inpaints else (plan_completion, run_completion)
-        plan = make_plan(cameras, points, config, size=config.image_size or model.size)
+        inpaints, size = config.task == "inpaint", config.image_size or model.size
+        generate = run_inpainting if inpaints else run_completion
+        if inpaints:
+            plan = plan_inpainting(cameras, points, config, size=size)
+        else:
+            plan = plan_completion(cameras, points, config, size=size, known=self._known_parts)
         done, _ = _without_requested(self._bank)
         if plan.rounds:
             told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
@@ -232,9 +259,11 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
     def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Do what was asked for in the viewer, one request before each iteration. What cannot be done is said there; training goes on."""
-        request = self.completion_panel.requests.take()
+        request = self.completion_panel.requests.take() or self._next_outdated()
         if request is None:
             return
+        if isinstance(request, RegenerateRound):
+            self._outdated = [number for number in self._outdated if number != request.number]
         try:
             with own_randomness(self.device):
                 said = self._serve(request, attributes, step)
@@ -248,13 +277,37 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
     def _serve(self, request: Request, attributes: TrainingCallbackAttributes, step: int) -> str:
         """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises ValueError."""
         if isinstance(request, RemoveView):
-            self._set_bank(without_view(self._bank, request.key))
-            said = f"1 view removed; {views_in_words(len(self._bank or ()))} left."
+            said = self._remove(request, attributes)
         else:
             said = self._generate_requested(request, attributes, step)
         self._save_bank(attributes.trainer)
         save_checkpoint(attributes.trainer, step)
         return said
+
+    def _next_outdated(self) -> RegenerateRound | None:
+        """A round that stands on anchors which are no more, to be generated as it was, from the new ones."""
+        there = [] if self._bank is None else self._bank.rounds
+        self._outdated = [number for number in self._outdated if number in there]
+        waits = self.config.completion.enabled and self._outdated
+        return RegenerateRound(number=self._outdated[0], seed=None) if waits else None
+
+    def _remove(self, request: RemoveView, attributes: TrainingCallbackAttributes) -> str:
+        before, place = self._bank, place_of(self._bank, request.key)
+        after = without_view(before, request.key)
+        assert before is not None and place is not None  # without_view has raised otherwise
+        gone = self._forget(before[[place]], after, self._captured_cameras(), attributes)
+        self._set_bank(after)
+        return f"1 view removed, with {gone} Gaussians that no other view shows; {views_in_words(len(after or ()))} left."
+
+    def _forget(
+        self, leaving: CompletedViews, staying: CompletedViews | None, cameras: list[Pinholes], attributes: TrainingCallbackAttributes
+    ) -> int:
+        """Take away the Gaussians that only these views had a say in; returns how many."""
+        splats = splats_of(attributes)
+        if not hasattr(splats, "remove_gaussians"):
+            return 0
+        gone = seen_by_nobody_else(splats.means, leaving, staying, cameras, self._known_parts)
+        return splats.remove_gaussians(gone, attributes.optimizers)
 
     def _generate_requested(self, request: CompleteFrom | RegenerateRound, attributes: TrainingCallbackAttributes, step: int) -> str:
         """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
@@ -263,22 +316,32 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         model, cameras = self._load_inpainter(), self._captured_cameras()
         points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
         survey = dataclasses.replace(config, anchor_views=0, densify_rounds=0, camera_path=None)
-        scene = plan_completion(cameras, points, survey, size=config.image_size or model.size)
-        planned = plan_request(request, scene, self._bank, cameras, config)
+        scene = plan_completion(cameras, points, survey, size=config.image_size or model.size, known=self._known_parts)
+        planned = plan_request(request, scene, self._bank, cameras, config, self._known_parts)
         context = [self._captured_view(index, cameras[index]) for index in planned.plan.context]
         with Bars(self.completion_panel, 1) as bars:
             (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found)
         del model
         release_memory()
+        if self._bank is not None and planned.replaces:
+            self._forget(self._bank[planned.replaces], planned.done, cameras, attributes)
         new, added = self._seed_unseen(new, attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self._bank, planned.replaces, new))
-        title = round_title(new.origins[0].role, new.origins[0].round)
-        seconds = time.perf_counter() - started
-        return f"{title}: {views_in_words(len(new))} in {seconds:.0f} s with seed {new.origins[0].seed}, {added} Gaussians placed in holes."
+        origin, seconds = new.origins[0], time.perf_counter() - started
+        said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
+        if isinstance(request, RegenerateRound) and request.seed is not None:
+            self._outdated = sorted({*self._outdated, *standing_on(self._bank, request.number)})
+        follow = f" To be generated anew from the new anchors: {len(self._outdated)} rounds." if self._outdated else ""
+        return f"{said}{added} Gaussians placed in holes.{follow}"
 
     def _captured_cameras(self) -> list[Pinholes]:
         _ = self.cached_train  # undistortion changes the cameras, so it must come first
         return [camera.to("cpu") for camera in to_pinhole_list(self.train_cameras)]
+
+    @cached_property
+    def _known_parts(self) -> list[torch.Tensor | None]:
+        """Of each captured picture a small mask of what is known there, None where all is."""
+        return [coarse_mask(batch_known(data, "cpu")) if "mask" in data else None for data in self.cached_train]
 
     def _check_inpainter(self) -> None:
         """Raises Refused with one sentence for a model folder that cannot be used."""
@@ -325,7 +388,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if not seeds and config.generated_pixels == "all":
             return views, 0
         rendered = render_geometry(splats, coarse(views.cameras)) if step >= TRAINED_STEPS else None
-        unseen = find_unseen(views, cameras, shell, rendered)
+        unseen = find_unseen(views, cameras, shell, rendered, self._known_parts)
         if config.match_colors and rendered is not None:
             views = with_matched_colors(views, unseen, rendered)
         if config.generated_pixels == "unseen":
@@ -364,6 +427,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         return {
             "views": None if self._bank is None else self._bank.state(),
             "finished": self._finished,
+            "outdated": list(self._outdated),
+            "start_points": self._own_points,
             "captured_draws": self._captured_draws,
         }
 
@@ -371,6 +436,10 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Restores what :meth:`get_extra_state` gave; nothing is generated again."""
         self._finished = bool(state["finished"])
         self._captured_draws = int(state["captured_draws"])
+        self._outdated = [int(number) for number in state.get("outdated", ())]
+        if state.get("start_points") is not None:  # not triangulated again: interrupted rounds are planned from the very same points
+            self._own_points = state["start_points"].cpu()
+            self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
 
 

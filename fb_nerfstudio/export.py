@@ -74,7 +74,8 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
 def _captured_frames(completed: CompletedCapture, folder: Path, held_out: bool) -> list[Frame]:
     """The capture's pictures and masks in the folder. Masks are for all or for none, as nerfstudio wants."""
     frames = completed.capture.frames
-    masked = any(frame.mask_path is not None for frame in frames) or not bool(completed.generated.masks.all())
+    masked = any(frame.mask_path is not None or media.has_alpha(frame.image_path) for frame in frames)
+    masked = masked or not bool(completed.generated.masks.all())
     chosen = [index for index in range(len(frames)) if held_out or index not in completed.held_out]
     names = _file_names([frames[index] for index in chosen])
     return [

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fb_core.data.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.completed_views import DENSIFY, REQUESTED, CompletedViews
+from fb_nerfstudio.completed_views import ANCHOR, DENSIFY, REQUESTED, CompletedViews
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, PlannedRound, lens_of
 from fb_nerfstudio.context_views import nearest_context
@@ -55,13 +54,14 @@ class RegenerateRound:
 
     number: int
     """The round."""
-    seed: int = 0
-    """Decides the pictures; where it is the round's own, the next one is taken."""
+    seed: int | None = 0
+    """Decides the pictures; where it is the round's own, the next one is taken. None keeps seed and prompt: what conditions the round
+    has changed."""
     prompt: str = ""
     """What is to be seen, for models that read text."""
 
     def __post_init__(self) -> None:
-        _check_seed(self.seed)
+        _check_seed(self.seed or 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +139,7 @@ def plan_request(
     bank: CompletedViews | None,
     cameras: Sequence[Pinholes],
     config: CompletionConfig,
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
 ) -> PlannedRequest:
     """Decide cameras and context.
 
@@ -151,6 +152,7 @@ def plan_request(
         bank: the generated views so far.
         cameras: the capture's.
         config: the completion's options.
+        known: of each captured picture its known part, None for all of it; without, all of them are known.
 
     Raises:
         ValueError: a sentence for a place outside the scene and for a round that is not there.
@@ -161,19 +163,21 @@ def plan_request(
         new = fan_from(request, scene, focal=focal, size=size)
         taken = [config.densify_rounds] if bank is None else [config.densify_rounds, *bank.rounds]
         number = 1 + max(taken)  # smaller ones are the automatic rounds'
-        role, seed, replaces = REQUESTED, request.seed, ()
+        role, seed, prompt, replaces = REQUESTED, request.seed, request.prompt, ()
     else:
         replaces = () if bank is None else tuple(i for i, origin in enumerate(bank.origins) if origin.round == request.number)
         if bank is None or not replaces:
             raise ValueError(f"Round {request.number} has no views any more; nothing was generated.")
         new, number, origin = bank[replaces].cameras.to("cpu"), request.number, bank.origins[replaces[0]]
-        role, seed = origin.role, request.seed if request.seed != origin.seed else request.seed + 1
-        if role != REQUESTED and config.camera_path is not None:
-            aspect = read_camera_path(config.camera_path, size=size).aspect
+        role, aspect = origin.role, origin.aspect
+        if request.seed is None:
+            seed, prompt = origin.seed, origin.prompt
+        else:
+            seed, prompt = request.seed + (request.seed == origin.seed), request.prompt
     nearest = role == REQUESTED or (role == DENSIFY and config.context_choice == "overlap")
-    context = nearest_context(cameras, new, scene.shell, config.context_views) if nearest else scene.context
+    context = nearest_context(cameras, new, scene.shell, config.context_views, known) if nearest else scene.context
     kept = [] if bank is None else [index for index in range(len(bank)) if index not in set(replaces)]
-    planned = PlannedRound(number=number, role=role, seed=seed, prompt=request.prompt, cameras=new, aspect=aspect)
+    planned = PlannedRound(number=number, role=role, seed=seed, prompt=prompt, cameras=new, aspect=aspect)
     plan = CompletionPlan(shape=scene.shape, shell=scene.shell, captured=len(cameras), context=tuple(context), rounds=(planned,), size=size)
     return PlannedRequest(plan=plan, replaces=replaces, done=bank[kept] if bank is not None and kept else None)
 
@@ -217,6 +221,13 @@ def without_view(bank: CompletedViews | None, key: str) -> CompletedViews | None
     if bank is None or place is None:
         raise ValueError("This view is not there any more; nothing was removed.")
     return None if len(bank) == 1 else bank[[index for index in range(len(bank)) if index != place]]
+
+
+def standing_on(bank: CompletedViews | None, number: int) -> list[int]:
+    """The rounds that a round conditioned: all others, ascending, for the anchors, none for any other round."""
+    if bank is None or all(origin.role != ANCHOR for origin in bank.origins if origin.round == number):
+        return []
+    return [other for other in bank.rounds if other != number]
 
 
 def merged(bank: CompletedViews | None, replaces: Sequence[int], new: CompletedViews) -> CompletedViews:

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from gsplat.strategy.ops import remove
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.optimizers import Optimizers
@@ -200,6 +201,22 @@ class FillerbusterSplatModel(SplatfactoModel):
                 optimizers.parameters[name] = [self.gauss_params[name]]
         self.info = {}
         return len(chosen)
+
+    @torch.no_grad()
+    def remove_gaussians(self, chosen: Bool[Tensor, " m"], optimizers: Optimizers) -> int:
+        """Take the chosen Gaussians away during training, between iterations; returns how many went. Never the last of all.
+
+        The others keep values and optimizer state.
+        """
+        chosen = chosen.to(self.device)
+        if not bool(chosen.any()) or bool(chosen.all()):
+            return 0
+        remove(params=self.gauss_params, optimizers=optimizers.optimizers, state=self.strategy_state, mask=chosen)
+        for name in self.gauss_params:
+            if name in optimizers.parameters:  # what gradient clipping reads
+                optimizers.parameters[name] = [self.gauss_params[name]]
+        self.info = {}
+        return int(chosen.sum())
 
     # ---------------------------------------------------------------------------------------------------- rendering
 

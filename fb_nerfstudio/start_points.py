@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
-from fb_core.data.media import read_image, resize
+from fb_core.data.media import read_image, read_image_with_alpha, resize
 from fb_core.data.undistort import check_lens, straight_directions
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import CaptureShape
@@ -60,13 +60,13 @@ class _Photo:
         lens = _lens(cameras, index)
         if lens is None:
             return None
-        image = read_image(outputs.image_filenames[index], apply_orientation=False)  # as nerfstudio reads it
+        image, alpha = read_image_with_alpha(outputs.image_filenames[index], apply_orientation=False)  # as nerfstudio reads it
         scale = min(1.0, _SIDE / max(image.shape[1:]))
         height, width = (max(1, round(side * scale)) for side in image.shape[1:])
-        known = None
+        masks = [] if alpha is None else [alpha]
         if outputs.mask_filenames is not None:
-            mask = read_image(outputs.mask_filenames[index], apply_orientation=False)[:1]
-            known = (resize(mask, height, width) > 0.999).float()
+            masks.append(read_image(outputs.mask_filenames[index], apply_orientation=False)[:1])
+        known = torch.stack([(resize(mask, height, width) > 0.999).float() for mask in masks]).amin(dim=0) if masks else None
         camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)
         return cls(resize(image, height, width).clamp(0, 1), known, camera, *lens)
 

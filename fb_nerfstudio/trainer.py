@@ -6,7 +6,7 @@ import os
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -49,6 +49,17 @@ class FillerbusterTrainer(Trainer):
     """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on, on a CPU to the same bits."""
 
     config: FillerbusterTrainerConfig
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """As nerfstudio. A run that goes on takes its Gaussians from the checkpoint: no start is sought for it."""
+        datamanager: Any = self.config.pipeline.datamanager
+        goes_on = self.config.load_dir is not None or self.config.load_checkpoint is not None
+        wanted = datamanager.start_points
+        try:
+            datamanager.start_points = 0 if goes_on else wanted
+            super().setup(test_mode)
+        finally:
+            datamanager.start_points = wanted
 
     def train_iteration(self, step: int) -> Any:
         """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed run repeats them."""

@@ -1,7 +1,7 @@
-"""What the capture has not seen: which pixels of generated views, how far away they are, and Gaussians to put there.
+"""What the capture has not seen: which pixels of generated views, how far away they are, and Gaussians to put there or to take away.
 
-Two sources tell what was seen: the captured cameras' frusta (always), and the splats' own accumulation and depth once they
-have been trained for a while.
+Two sources tell what was seen: the known parts of the captured pictures (always), and the splats' own accumulation and depth once
+they have been trained for a while.
 """
 
 from __future__ import annotations
@@ -94,18 +94,34 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit)).long()]
 
 
-def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shell, rendered: Rendered | None) -> Unseen:
+def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:
+    """The known-mask of a captured picture, small: True where most of a cell is known; None when all is."""
+    if bool((known == 1).all()):
+        return None
+    scale = min(1.0, _SIDE / max(known.shape[1:]))
+    size = [max(1, round(side * scale)) for side in known.shape[1:]]
+    return F.interpolate(known[None], size=size, mode="area")[0, 0] >= 0.5
+
+
+def find_unseen(
+    views: CompletedViews,
+    captured: Sequence[Pinholes],
+    shell: Shell,
+    rendered: Rendered | None,
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+) -> Unseen:
     """Which pixels of generated views show what the capture has not.
 
-    A pixel is seen when its surface point falls into a captured picture and, if ``rendered`` tells, splats cover it. Just beside the
-    captured pictures firm splats are believed too: they continue what was captured better than a generated picture would. The
-    surface point is the splats' where they cover the pixel and the shell's elsewhere.
+    A pixel is seen when its surface point falls into the known part of a captured picture and, if ``rendered`` tells, splats cover it.
+    Just beside the captured pictures firm splats are believed too: they continue what was captured better than a generated picture
+    would. The surface point is the splats' where they cover the pixel and the shell's elsewhere.
 
     Args:
         views: the generated views.
         captured: the capture's cameras.
         shell: the guessed surface, for depth.
         rendered: the splats from the views' cameras made coarse, or None while they are untrained.
+        known: of each captured picture :func:`coarse_mask`; without, all of them are known.
     """
     cameras = coarse(views.cameras)
     directions = cameras.directions()
@@ -119,9 +135,10 @@ def find_unseen(views: CompletedViews, captured: Sequence[Pinholes], shell: Shel
     flat = surface.reshape(-1, 3)
     finite = torch.nan_to_num(flat, posinf=1e9, neginf=-1e9)
     nearby = [camera.to("cpu", torch.float32) for camera in captured]
-    inside = seen_by(nearby, finite).reshape(covered.shape)
+    inside = seen_by(nearby, finite, known).reshape(covered.shape)
     if rendered is not None:
-        beside = seen_by([_widened(camera) for camera in nearby], finite).reshape(covered.shape)
+        wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
+        beside = seen_by([_widened(camera) for camera in nearby], finite, wider).reshape(covered.shape)
         inside |= beside & (rendered.accumulation >= _FIRM)
     return Unseen(mask=~(covered & inside), points=points)
 
@@ -130,6 +147,12 @@ def _widened(camera: Pinholes) -> Pinholes:
     """The same camera with a picture that shows more to all sides."""
     x, y = round(camera.width * _BESIDE), round(camera.height * _BESIDE)
     return camera.cropped(-x, -y, camera.width + 2 * x, camera.height + 2 * y)
+
+
+def _widened_mask(known: Bool[Tensor, "h w"]) -> Bool[Tensor, "_h _w"]:
+    """The mask of :func:`_widened`: what was masked out stays unknown, what lies beside the picture counts as known."""
+    y, x = (round(side * _BESIDE) for side in known.shape)
+    return F.pad(known, (x, x, y, y), value=True)
 
 
 def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendered) -> CompletedViews:
@@ -165,3 +188,35 @@ def unseen_gaussians(
     colors = rearrange(F.interpolate(images, size=usable.shape[1:], mode="area"), "n c h w -> n h w c")
     chosen = torch.randperm(int(usable.sum()), generator=generator)[:limit]
     return unseen.points[usable][chosen], colors[usable][chosen]
+
+
+def seen_by_nobody_else(
+    means: Float[Tensor, "m 3"],
+    leaving: CompletedViews,
+    staying: CompletedViews | None,
+    captured: Sequence[Pinholes],
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+) -> Bool[Tensor, "m"]:
+    """Which Gaussians only the views that leave the bank had a say in: their centres lie in a supervised pixel of those, and in none of
+    the generated views that stay nor in a known pixel of the capture. Nothing would train them any more.
+
+    Occlusion is not considered, so that what a staying picture may show is left alone.
+
+    Args:
+        means: centres of the Gaussians.
+        leaving: the views that go.
+        staying: the generated views that stay, or None.
+        captured: the capture's cameras.
+        known: of each captured picture :func:`coarse_mask`; without, all of them are known.
+    """
+    points = means.detach().to("cpu", torch.float32)
+    nearby = [camera.to("cpu", torch.float32) for camera in captured]
+    kept = seen_by(nearby, points, known)
+    if staying is not None:
+        kept |= _supervised(staying, points)
+    return _supervised(leaving, points) & ~kept
+
+
+def _supervised(views: CompletedViews, points: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
+    cameras = views.cameras.to("cpu", torch.float32)
+    return seen_by([cameras[index] for index in range(len(cameras))], points, [*views.masks[..., 0].cpu()])

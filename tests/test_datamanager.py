@@ -21,6 +21,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import sphere
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
+from fb_nerfstudio import datamanager
 from fb_nerfstudio.completed_views import CompletedViews, Origin
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
@@ -89,6 +90,7 @@ def stand_in_model(monkeypatch):
 
     monkeypatch.setattr(FillerbusterDataManager, "_load_inpainter", load)
     monkeypatch.setattr(FillerbusterDataManager, "_check_inpainter", lambda self: None)
+    monkeypatch.setattr(datamanager, "release_memory", lambda: None)  # nothing large here, and each time takes half a second
 
 
 def options(**changes) -> CompletionConfig:

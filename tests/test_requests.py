@@ -11,10 +11,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from test_datamanager import GreyFiller, attributes, generated, make, options, run_callbacks, stand_in_model, toy_viewer
+from test_camera_path import write_path
+from test_datamanager import GreyFiller, ToySplats, attributes, generated, make, options, run_callbacks, stand_in_model, toy_viewer
 
 from fb_core.data.captures import validate_capture
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.paths import sphere_directions
 from fb_core.geometry.shell import sphere
 from fb_nerfstudio.completed_views import CompletedViews, Origin
 from fb_nerfstudio.completion_config import CompletionConfig
@@ -34,6 +36,7 @@ from fb_nerfstudio.requests import (
     plan_request,
     without_view,
 )
+from fb_nerfstudio.unseen import seen_by_nobody_else
 from fb_nerfstudio.viewer import CompletionPanel
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -381,6 +384,97 @@ def test_a_round_generated_anew(tiny_capture: Path):
     assert [origin.seed for origin in after.origins] == [77] * 4 + [before.origins[4].seed] * 2
     assert torch.equal(after.cameras.camera_to_world, before.cameras.camera_to_world)
     assert not torch.equal(after.images[:4], before.images[:4]) and torch.equal(after.images[4:], before.images[4:])
+
+
+def test_new_anchors_bring_the_rounds_that_stand_on_them_one_per_iteration(tiny_capture: Path, tmp_path: Path):
+    manager = make(tiny_capture, options(densify_rounds=2))
+    attrs = generated(manager, tmp_path)
+    before = manager.generated_views
+    ask_for(manager, RegenerateRound(number=0, seed=77))
+    run_callbacks(manager, attrs, 1)
+    assert "new anchors: 2 rounds" in said(manager)
+    assert torch.equal(manager.generated_views.images[4:], before.images[4:]), "they wait for the next iterations"
+    state = torch.load(tmp_path / "nerfstudio_models" / "step-000000000.ckpt", weights_only=True)["pipeline"]["_extra_state"]
+
+    GreyFiller.calls = 0
+    for number, calls in ((2, 1), (3, 2), (4, 2)):
+        run_callbacks(manager, attrs, number)
+        assert GreyFiller.calls == calls
+    after = manager.generated_views
+    assert [origin.seed for origin in after.origins[4:]] == [origin.seed for origin in before.origins[4:]], (
+        "only what conditions them is new"
+    )
+
+    resumed = make(tiny_capture, options(densify_rounds=2))  # killed before the first of them
+    resumed.set_extra_state(state)
+    attrs = attributes(resumed)
+    run_callbacks(resumed, attrs, 1)
+    ask_for(resumed, RegenerateRound(number=2, seed=5))  # a person comes first
+    for number in (2, 3):
+        run_callbacks(resumed, attrs, number)
+    assert torch.equal(resumed.generated_views.of_round(1).images, after.of_round(1).images)
+    assert resumed.generated_views.of_round(2).origins[0].seed == 5, "it was up to date, and not done again"
+
+
+def test_a_following_round_that_fails_is_said_once_and_not_tried_forever(tiny_capture: Path, monkeypatch):
+    manager = make(tiny_capture)
+    attrs = generated(manager)
+    ask_for(manager, RegenerateRound(number=0, seed=77))
+    run_callbacks(manager, attrs, 1)
+
+    def fail(self, *args, **options):
+        GreyFiller.calls += 1
+        raise RuntimeError("out of memory")
+
+    GreyFiller.calls = 0
+    monkeypatch.setattr(GreyFiller, "complete", fail)
+    run_callbacks(manager, attrs, 2)
+    run_callbacks(manager, attrs, 3)
+    assert GreyFiller.calls == 1 and said(manager) == "Not done: out of memory"
+
+
+class TrackedSplats(ToySplats):
+    """Gaussians all around that can be taken away."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.means = 30 * sphere_directions(500, like=torch.zeros(1))
+
+    def remove_gaussians(self, chosen, optimizers) -> int:
+        self.means = self.means[~chosen]
+        return int(chosen.sum())
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_gaussians_that_only_a_removed_view_saw_go_with_it(tiny_capture: Path, anew: bool):
+    manager = make(tiny_capture, options(generated_pixels="all"))
+    attrs = generated(manager)
+    bank, cameras, before = manager.generated_views, manager._captured_cameras(), TrackedSplats().means
+    leaving = range(4) if anew else [0]  # all anchors, or one of them
+    staying = bank[[index for index in range(6) if index not in leaving]]
+    lone = seen_by_nobody_else(before, bank[leaving], staying, cameras, manager._known_parts)
+    assert 0 < int(lone.sum()) < 200
+    splats = attrs.pipeline.model = TrackedSplats()
+    ask_for(manager, RegenerateRound(number=0, seed=3) if anew else RemoveView(key=key_of(bank, 0)))
+    run_callbacks(manager, attrs, 1)
+    assert torch.equal(splats.means, before[~lone])
+    assert anew or f"with {int(lone.sum())} Gaussians that no other view shows" in said(manager)
+
+
+def test_a_round_of_a_camera_path_anew_keeps_its_margins_without_the_file(tiny_capture: Path, tmp_path: Path):
+    file = write_path(tmp_path / "path.json", 5, width=32, height=16)
+    manager = make(tiny_capture, options(anchor_views=3, camera_path=file, generated_pixels="all"))
+    attrs = generated(manager)
+    state = manager.get_extra_state()
+    before = manager.generated_views.masks
+    assert not bool(before[:, :4].any())
+    resumed = make(tiny_capture, options(anchor_views=3, generated_pixels="all"))  # another day, without the file
+    resumed.set_extra_state(state)
+    attrs = attributes(resumed)
+    run_callbacks(resumed, attrs, 1)
+    ask_for(resumed, RegenerateRound(number=1, seed=3))
+    run_callbacks(resumed, attrs, 2)
+    assert resumed.generated_views.of_round(1).origins[0].seed == 3 and torch.equal(resumed.generated_views.masks, before)
 
 
 def test_views_asked_for_before_the_automatic_ones_do_not_change_these(tiny_capture: Path):

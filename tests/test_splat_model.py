@@ -485,6 +485,27 @@ def test_adding_respects_the_cap_and_refuses_nonsense() -> None:
         model.add_gaussians(points * torch.nan, torch.rand(10, 3), optimizers)
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_gaussians_that_go_leave_the_others_as_they_were(strategy: str) -> None:
+    model = make_model(60, strategy=strategy)
+    optimizers = make_optimizers(model)
+    for step in range(1, 4):
+        train_step(model, optimizers, step)
+    before = {name: values.detach().clone() for name, values in model.gauss_params.items()}
+    moments = {name: optimizers.optimizers[name].state[held(optimizers, name)]["exp_avg"].clone() for name in before}
+    chosen = torch.zeros(60, dtype=torch.bool)
+    chosen[10:25] = True
+    assert model.remove_gaussians(chosen, optimizers) == 15
+    for name, values in model.gauss_params.items():
+        assert held(optimizers, name) is values and optimizers.parameters[name][0] is values, name
+        assert torch.equal(values, before[name][~chosen]), name
+        assert torch.equal(optimizers.optimizers[name].state[values]["exp_avg"], moments[name][~chosen])
+    for step in range(4, 8):
+        train_step(model, optimizers, step)
+    assert model.remove_gaussians(torch.zeros(model.num_points, dtype=torch.bool), optimizers) == 0
+    assert model.remove_gaussians(torch.ones(model.num_points, dtype=torch.bool), optimizers) == 0, "never all"
+
+
 def test_seed_colours_are_bytes() -> None:
     model = FillerbusterSplatModelConfig(sh_degree=0).setup(
         scene_box=SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])),

@@ -66,6 +66,17 @@ def has_alpha(path: str | Path) -> bool:
     return "A" in names
 
 
+def has_alpha(path: str | Path) -> bool:
+    """Whether a still image has an alpha channel, from the file's header (HEIC files are decoded)."""
+    path = _checked_file(path)
+    if path.suffix.lower() in _HEIF_SUFFIXES:
+        return "A" in _decode_heif(path)[1]
+    reader = _opened(path)
+    names = reader.spec().channelnames
+    reader.close()
+    return "A" in names
+
+
 def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int, int]:
     """(height, width) in pixels, upright, from the file's header and its end (a file cut short is refused); nothing is decoded."""
     path = _checked_file(path)

@@ -8,6 +8,7 @@ unseen, so that a few views together see all directions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -134,13 +135,27 @@ def kept_clear(
     return result
 
 
-def seen_by(cameras: list[Pinholes], points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Whether a world point falls into at least one camera's picture (occlusion is not considered)."""
+def seen_by(
+    cameras: Sequence[Pinholes], points: Float[Tensor, "n 3"], known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None
+) -> Bool[Tensor, "n"]:
+    """Whether a world point falls into the known part of at least one camera's picture (occlusion is not considered).
+
+    Args:
+        cameras: one camera per entry where ``known`` is given.
+        points: in world coordinates.
+        known: of each camera a mask of any size that covers its picture, or None for all of it; without, all pictures are known.
+    """
     seen = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for camera in cameras:
+    masks = [None] * len(cameras) if known is None else known
+    for camera, mask in zip(cameras, masks, strict=True):
         pixels, depth = camera.project(points)
         size = pixels.new_tensor([camera.width, camera.height])
-        seen |= ((pixels > 0) & (pixels < size)).all(dim=-1).logical_and(depth > 0).any(dim=0)
+        inside = ((pixels > 0) & (pixels < size)).all(dim=-1) & (depth > 0)
+        if mask is not None:
+            cells = pixels[inside] / size * pixels.new_tensor([mask.shape[1], mask.shape[0]])
+            column, row = cells.long().unbind(dim=-1)
+            inside[inside.clone()] = mask[row.clamp(max=mask.shape[0] - 1), column.clamp(max=mask.shape[1] - 1)]
+        seen |= inside.any(dim=0)
     return seen
 
 
