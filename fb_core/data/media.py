@@ -58,18 +58,7 @@ def read_image_with_alpha(
 def has_alpha(path: str | Path) -> bool:
     """Whether a still image has an alpha channel, from the file's header (HEIC files are decoded)."""
     path = _checked_file(path)
-    if path.suffix.lower() in _HEIF_SUFFIXES:
-        return "A" in _decode_heif(path)[1]
-    reader = _opened(path)
-    names = reader.spec().channelnames
-    reader.close()
-    return "A" in names
-
-
-def has_alpha(path: str | Path) -> bool:
-    """Whether a still image has an alpha channel, from the file's header (HEIC files are decoded)."""
-    path = _checked_file(path)
-    if path.suffix.lower() in _HEIF_SUFFIXES:
+    if path.suffix.lower() in HEIF_SUFFIXES:
         return "A" in _decode_heif(path)[1]
     reader = _opened(path)
     names = reader.spec().channelnames
