@@ -98,7 +98,7 @@ def test_alpha_comes_apart_and_does_not_darken_the_colours(tmp_path: Path, mode:
 # ---- orientation ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_all_orientations(tmp_path: Path, orientation: int, suffix: str) -> None:
     """Pillow's transposition is the oracle; the size from the header agrees; the stored pixels can be had too."""
@@ -107,7 +107,7 @@ def test_all_orientations(tmp_path: Path, orientation: int, suffix: str) -> None
     tags = Image.Exif()
     tags[0x0112] = orientation
     path = tmp_path / f"photo{suffix}"
-    Image.fromarray(array).save(path, exif=tags, **({"quality": 95, "subsampling": 0} if suffix == ".jpg" else {}))
+    Image.fromarray(array).save(path, exif=tags, **{".jpg": {"quality": 95, "subsampling": 0}, ".webp": {"lossless": True}}.get(suffix, {}))
     with Image.open(path) as stored:
         expected = torch.from_numpy(np.asarray(ImageOps.exif_transpose(stored)).copy()).permute(2, 0, 1) / 255
     found = media.read_image(path)

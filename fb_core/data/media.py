@@ -47,6 +47,8 @@ def read_image_with_alpha(
     if apply_orientation:
         pixels = _upright(pixels, orientation)
     alpha = pixels[names.index("A")][None] if "A" in names else None
+    if names[:3] == ["R", "G", "B"]:
+        return pixels[:3], alpha
     if {"R", "G", "B"} <= set(names):
         return pixels[[names.index(name) for name in "RGB"]], alpha
     luminance = [index for index, name in enumerate(names) if name in ("Y", "I", "L")] or ([0] if len(names) == 1 else [])
@@ -74,7 +76,7 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
         return height, width
     reader = _opened(path)
     spec = reader.spec()
-    height, width, orientation = spec.height, spec.width, spec.get_int_attribute("Orientation", 1)
+    height, width, orientation = spec.height, spec.width, _orientation(path, spec)
     reader.close()
     return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
 
@@ -140,7 +142,7 @@ def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tens
 
 
 def shrink(image: Float[Tensor, "c h w"], longest_side: int | None) -> Float[Tensor, "c h2 w2"]:
-    """The image made smaller, so that its longer side has at most ``longest_side`` pixels: each new pixel is the mean of the area it covers.
+    """The image made smaller, so that its longer side has at most ``longest_side`` pixels: a new pixel is the mean of the area it covers.
 
     An image that is small enough already, or None, comes back as it is. No side becomes shorter than one pixel.
     """
@@ -246,8 +248,18 @@ def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     if array is None or error:
         raise ValueError(f"image {path}: damaged or truncated ({_one_line(error)}); copy it again from its source")
     pixels = rearrange(torch.from_numpy(np.ascontiguousarray(array)), "h w c -> c h w")
-    pixels = pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
-    return pixels.contiguous(), list(spec.channelnames), spec.get_int_attribute("Orientation", 1)
+    planes = pixels.to(torch.float32, memory_format=torch.contiguous_format)
+    return planes.div_(255) if kind == oiio.UINT8 else planes, list(spec.channelnames), _orientation(path, spec)
+
+
+def _orientation(path: Path, spec) -> int:
+    """The EXIF orientation (1 = upright); of WebP files, whose tags OpenImageIO does not read, by Pillow."""
+    if path.suffix.lower() != ".webp":
+        return spec.get_int_attribute("Orientation", 1)
+    from PIL import ExifTags, Image
+
+    with Image.open(path) as image:
+        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
 
 
 def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
@@ -280,7 +292,7 @@ def _upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, 
     if orientation in (5, 6, 7, 8):
         pixels = pixels.transpose(1, 2)
     flips = {2: [2], 3: [1, 2], 4: [1], 6: [2], 7: [1, 2], 8: [1]}.get(orientation, [])
-    return pixels.flip(flips).contiguous()
+    return (pixels.flip(flips) if flips else pixels).contiguous()
 
 
 # ---- encoding -------------------------------------------------------------------------------------------------------

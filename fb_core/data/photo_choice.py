@@ -7,28 +7,30 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data import media
 from fb_core.data.photos import Photo
 from fb_core.geometry.paths import spread_subset
 
 _FLAT = 0.01  # standard deviation of brightness: below, a picture shows nothing
 _BLACK = 0.04  # mean brightness
-_SAME = 0.004  # mean absolute difference of two thumbnails: one grey level of 255
-_TIME_WEIGHT = 0.5  # of the place in the sequence beside the appearance
+_SAME = 0.004  # mean absolute difference of two pictures: one grey level of 255
+_SAME_SIDE = 32  # pixels, at which traces of compression are averaged away
+_TIME_WEIGHT = 0.5  # distance of the first from the last photo beside that of their appearance
 
 
 def doubtful(photos: list[Photo]) -> dict[str, str]:
     """Names of photos that cannot help, with the reason: black, of one colour, or the same as an earlier photo. Cheap (thumbnails)."""
     reasons: dict[str, str] = {}
-    useful: list[Photo] = []
+    useful: dict[str, Tensor] = {}
     for photo in photos:
-        grey = photo.thumbnail.mean(dim=0)
-        twin = next((other.name for other in useful if _same(photo, other)), None)
-        if float(grey.std(correction=0)) < _FLAT:
-            reasons[photo.name] = "black" if float(grey.mean()) < _BLACK else "of one colour"
+        small = media.shrink(photo.thumbnail, _SAME_SIDE)
+        twin = next((name for name, other in useful.items() if _same(small, other)), None)
+        if float(small.mean(dim=0).std(correction=0)) < _FLAT:
+            reasons[photo.name] = "black" if float(small.mean()) < _BLACK else "of one colour"
         elif twin is not None:
             reasons[photo.name] = f"the same picture as {twin}"
         else:
-            useful.append(photo)
+            useful[photo.name] = small
     return reasons
 
 
@@ -47,8 +49,8 @@ def require_two_views(photos: list[Photo]) -> None:
 def choose_by_coverage(photos: list[Photo], count: int) -> list[int]:
     """Indices, ascending, of ``count`` photos that together show as much as possible; all when there are fewer.
 
-    With known poses they differ most in place and direction (:func:`fb_core.geometry.paths.spread_subset`). Without, they are picked farthest
-    first, by what they look like and by their place in the sequence; photos that are :func:`doubtful` come last.
+    With known poses they differ most in place and direction (:func:`fb_core.geometry.paths.spread_subset`). Without, they are picked
+    farthest first, by what they look like and by their place in the sequence; photos that are :func:`doubtful` come last.
     """
     if count >= len(photos):
         return list(range(len(photos)))
@@ -63,14 +65,10 @@ def choose_by_coverage(photos: list[Photo], count: int) -> list[int]:
 
 
 def _features(photos: list[Photo]) -> Float[Tensor, "n d"]:
-    """Appearance (8 x 8 colours without exposure, median distance 1) beside the place in the sequence."""
+    """Appearance (8 x 8 colours as a unit vector without exposure; unlike pictures are 1.4 apart) beside the place in the sequence."""
     small = torch.stack([F.adaptive_avg_pool2d(photo.thumbnail, (8, 8)).flatten() for photo in photos])
-    small = small - small.mean(dim=1, keepdim=True)
-    appearance = F.normalize(small, dim=1)
-    if len(photos) > 1:
-        appearance = appearance / F.pdist(appearance).median().clamp(min=1e-6)
-    place = torch.linspace(0, 1, len(photos))[:, None] * _TIME_WEIGHT
-    return torch.cat([appearance, place], dim=1)
+    appearance = F.normalize(small - small.mean(dim=1, keepdim=True), dim=1)
+    return torch.cat([appearance, torch.linspace(0, _TIME_WEIGHT, len(photos))[:, None]], dim=1)
 
 
 def _farthest_first(features: Float[Tensor, "n d"], count: int) -> list[int]:
@@ -84,8 +82,6 @@ def _farthest_first(features: Float[Tensor, "n d"], count: int) -> list[int]:
     return chosen
 
 
-def _same(first: Photo, second: Photo) -> bool:
-    """Whether two thumbnails differ by no more than another compression would."""
-    if first.thumbnail.shape != second.thumbnail.shape:
-        return False
-    return float((first.thumbnail - second.thumbnail).abs().mean()) < _SAME
+def _same(first: Tensor, second: Tensor) -> bool:
+    """Whether two small pictures differ by no more than another compression would."""
+    return first.shape == second.shape and float((first - second).abs().mean()) < _SAME

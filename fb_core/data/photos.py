@@ -71,10 +71,10 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
     """The photos of a folder (in natural order of names), of a film (in order of time), or of a posed capture (in its order).
 
     Args:
-        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a folder with a transforms.json,
-            whose generated views are left out.
-        most: at most so many. Photos are chosen by coverage and keep their order; frames by sharpness and even motion, ``FILM_FRAMES`` of
-            them when None.
+        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a folder with a
+            transforms.json, whose generated views are left out.
+        most: at most so many. Photos are chosen by coverage and keep their order; frames by sharpness and even motion, and they are
+            ``FILM_FRAMES`` when None.
 
     Raises:
         ValueError: one sentence, when fewer than two photos can be read.
@@ -138,13 +138,12 @@ def _still(path: Path, name: str) -> Photo:
     image, mask = pixels()
     size = (image.shape[1], image.shape[2])
     exif = read_exif(path, size)
-    lens = f"{exif.camera} {exif.focal_millimetres or 0:g} mm {max(size)} x {min(size)}" if exif.camera else ""
     return Photo(
         name=name,
         source=path,
         size=size,
         focal_prior=exif.focal_pixels,
-        device=lens,
+        device=f"{exif.lens} {max(size)} x {min(size)}" if exif.lens else "",
         seconds=exif.seconds,
         camera=None,
         thumbnail=_shrunk((image, mask), THUMBNAIL_SIDE)[0],
@@ -157,8 +156,9 @@ def _still_pixels(path: Path) -> Pixels:
     mask = torch.ones_like(image[:1]) if alpha is None else alpha.clamp(0, 1)
     if path.suffix.lower() == ".exr":
         image = media.to_srgb(image / mask.clamp(min=1e-6))  # colours of EXR files are linear and multiplied by alpha
-    finite = torch.isfinite(image).all(dim=0, keepdim=True)
-    return torch.where(finite, image.clamp(0, 1), 0.0), mask * finite
+        finite = torch.isfinite(image).all(dim=0, keepdim=True)
+        image, mask = torch.where(finite, image, 0.0), mask * finite
+    return image.clamp_(0, 1), mask
 
 
 # ---- posed captures -------------------------------------------------------------------------------------------------
@@ -228,7 +228,7 @@ def _readable(source: Path, readers: list[Callable[[], Photo]]) -> list[Photo]:
     for read in readers:
         try:
             photos.append(read())
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             faults.append(str(error))
     if len(photos) < 2:
         reason = (
@@ -256,10 +256,10 @@ def _unique_names(stems: list[str]) -> list[str]:
 
 
 def _as_file_name(stem: str) -> str:
-    return re.sub(r"[^\w.\- ]", "_", stem).strip(". ") or "photo"
+    return re.sub(r"[^\w.-]", "_", stem).strip(".") or "photo"
 
 
-def _shrunk(pixels: Pixels, longest_side: int | None) -> Pixels:
+def _shrunk(pixels: Pixels, longest_side: int | None) -> tuple[Float[Tensor, "3 h2 w2"], Float[Tensor, "1 h2 w2"]]:
     """Area averages of the known pixels; where nothing is known the colour is black."""
     image, mask = pixels
     if bool((mask == 1).all()):

@@ -7,6 +7,7 @@ along that way, not in time, and each is the sharpest near its place. Their pixe
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,14 +43,43 @@ class FilmFrame:
     """Time since the film's first frame."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Display:
+    """How stored frames are to be shown."""
+
+    size: tuple[int, int]
+    """(height, width) after the turn, with square pixels."""
+    matrix: np.ndarray
+    """The 2 x 2 part of the film's display matrix: a stored place (x, y) is shown at (x, y) @ matrix."""
+
+    @staticmethod
+    def of(frame: Any, pixel_aspect: float) -> Display:
+        """By a frame's side data and the width of a stored pixel for its height."""
+        # Asking a frame for its side data ties it into a cycle, which keeps its pixels for a while: one frame of a film tells for all.
+        data = frame.side_data.get("DISPLAYMATRIX")
+        matrix = np.eye(2) if data is None else np.frombuffer(bytes(data), dtype=np.int32).reshape(3, 3)[:2, :2] / 2**16
+        height, width = frame.height, max(1, round(frame.width * pixel_aspect))
+        stored = Display(size=(height, width), matrix=matrix)
+        return Display(size=(width, height), matrix=matrix) if stored.transposed else stored
+
+    @property
+    def transposed(self) -> bool:
+        """Whether stored rows are shown as columns."""
+        return bool(abs(self.matrix[0, 1]) + abs(self.matrix[1, 0]) > abs(self.matrix[0, 0]) + abs(self.matrix[1, 1]))
+
+
 class Film:
     """The chosen frames of a film, decoded on demand; pixels of at most ``_CACHE_BYTES`` are kept."""
 
-    def __init__(self, path: Path, frames: list[FilmFrame], size: tuple[int, int]):
-        self.path, self.frames, self.size = path, frames, size
-        """``size`` is (height, width) upright."""
+    def __init__(self, path: Path, frames: list[FilmFrame], display: Display):
+        self.path, self.frames, self._display = path, frames, display
         self._kept: dict[int, np.ndarray] = {}
         self._lock = threading.Lock()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels, upright."""
+        return self._display.size
 
     def load(self, frame: FilmFrame) -> Float[Tensor, "3 h w"]:
         """The frame upright at full size, RGB in [0, 1]. Raises ValueError when the film has become unreadable."""
@@ -66,12 +96,12 @@ class Film:
         """
         self._kept.clear()
         wanted = {one.pts for one in self.frames if one.pts >= frame.pts}
-        room = max(1, _CACHE_BYTES // (3 * self.size[0] * self.size[1]))
+        room = max(1, _CACHE_BYTES // (3 * math.prod(self.size)))
         for found in _frames(self.path, [], from_pts=frame.pts):
             if found.key_frame and self._kept:
                 break
             if found.pts in wanted:
-                self._kept[found.pts] = _pixels(found, self.size)
+                self._kept[found.pts] = _pixels(found, self._display)
             if len(self._kept) == min(room, len(wanted)):
                 break
         if frame.pts not in self._kept:
@@ -87,24 +117,24 @@ def read_film(path: Path, most: int) -> Film:
         ValueError: one sentence, for a file that is no film and for a film of which fewer than two frames can be decoded.
     """
     faults: list[str] = []
-    frames, sharpness, travelled, size = _survey(path, faults)
+    frames, sharpness, travelled, display = _survey(path, faults)
     fault = f" ({faults[0]})" if faults else ""
-    if len(frames) < 2:
+    if len(frames) < 2 or display is None:
         what = "copy it again from its source" if faults else "give a longer film or a folder of photos"
         raise ValueError(f"film {path}: expected at least 2 frames, got {len(frames)} that can be decoded{fault}; {what}")
     if faults:
         _logger.warning("film %s is damaged or truncated%s: its %d good frames are used", path, fault, len(frames))
     chosen = choose_frames(sharpness, travelled, most)
     _logger.info("film %s: %d of %d frames chosen", path, len(chosen), len(frames))
-    return Film(path, [frames[index] for index in chosen], size)
+    return Film(path, [frames[index] for index in chosen], display)
 
 
 def choose_frames(sharpness: np.ndarray, travelled: np.ndarray, most: int) -> list[int]:
     """Indices of at most ``most`` frames: evenly along the way that the camera went, each the sharpest near its place.
 
     The way is cut into as many equal parts as frames are wanted. In the middle half of each part the sharpest frame is taken, so that two
-    neighbours are apart by half a part to one and a half. Sharpness counts relative to its surroundings, because a bare wall is not blurred.
-    Where the film jumps over a part, none is taken, so that no two show the same.
+    neighbours are apart by half a part to one and a half. Sharpness counts relative to the frames around, because a bare wall is not
+    blurred. Where the film jumps over a part, none is taken, so that no two show the same.
 
     Args:
         sharpness: of each frame, at least 0.
@@ -139,25 +169,26 @@ def _local_median(values: np.ndarray, reach: int = 15) -> np.ndarray:
 # ---- the first pass -------------------------------------------------------------------------------------------------
 
 
-def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray, np.ndarray, tuple[int, int]]:
-    """All frames that can be decoded, their sharpness, how far the camera has moved until each, and the size upright."""
+def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray, np.ndarray, Display | None]:
+    """All frames that can be decoded, their sharpness, how far the camera has moved until each, and how they are shown."""
     frames: list[FilmFrame] = []
     sharpness: list[float] = []
     way: list[float] = []
-    size, start, odometer = (0, 0), 0.0, _Odometer()
+    display, start, odometer = None, 0.0, _Odometer()
+    announced, pixel_aspect = _header(path)
     for frame in _frames(path, faults):
         if frame.pts is None or frame.time is None or (frames and frame.pts <= frames[-1].pts):
             faults.append("some frames have no time; ffmpeg -i FILM film.mp4 writes it anew")
             continue
-        if not frames:
-            size, start = _upright_size(frame), frame.time
+        if display is None:
+            display, start = Display.of(frame, pixel_aspect), frame.time
         frames.append(FilmFrame(number=len(frames), pts=frame.pts, seconds=frame.time - start))
         grey = _small_grey(frame)
         sharpness.append(_sharpness(grey))
         way.append(odometer.moved(grey))
-    if frames and frames[-1].seconds < _LEAST_COMPLETE * (announced := _announced_seconds(path)) - 1:
+    if frames and frames[-1].seconds < _LEAST_COMPLETE * announced - 1:
         faults.append(f"it ends after {frames[-1].seconds:.1f} of {announced:.1f} seconds")
-    return frames, np.array(sharpness), np.array(way), size
+    return frames, np.array(sharpness), np.array(way), display
 
 
 class _Odometer:
@@ -209,7 +240,7 @@ def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> It
         faults: sentences are appended.
         from_pts: begin at the last key frame before this time stamp.
     """
-    import av
+    from av.error import FFmpegError
 
     with _opened(path) as container:
         stream = container.streams.video[0]
@@ -221,7 +252,7 @@ def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> It
             try:
                 packet = next(packets, None)
                 decoded = [] if packet is None else packet.decode()
-            except av.error.FFmpegError as error:
+            except FFmpegError as error:
                 faults.append(str(error))
                 continue  # after an error of the container itself there is no next packet
             yield from (frame for frame in decoded if not frame.is_corrupt)
@@ -232,12 +263,13 @@ def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> It
 def _opened(path: Path) -> Any:
     """PyAV's container of a file with at least one video track."""
     import av
+    from av.error import FFmpegError
 
     try:
         container = av.open(str(path))
     except PermissionError:
         raise
-    except (av.error.FFmpegError, OSError) as error:
+    except (FFmpegError, OSError) as error:
         raise ValueError(
             f"film {path}: not readable as a film ({error.strerror}), expected MP4, MOV, MKV, WebM or AVI; was it copied completely?"
         ) from error
@@ -247,11 +279,12 @@ def _opened(path: Path) -> Any:
     return container
 
 
-def _announced_seconds(path: Path) -> float:
-    """How long the film is by its header; 0 where that does not tell."""
+def _header(path: Path) -> tuple[float, float]:
+    """How many seconds the film lasts (0 = not told), and how wide a stored pixel is for its height."""
     with _opened(path) as container:
         stream = container.streams.video[0]
-        return float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
+        seconds = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
+        return seconds, float(stream.sample_aspect_ratio or 1)
 
 
 def _small_grey(frame: Any) -> np.ndarray:
@@ -261,38 +294,13 @@ def _small_grey(frame: Any) -> np.ndarray:
     return frame.reformat(width=width, height=height, format="gray8", interpolation="AREA").to_ndarray()
 
 
-def _upright_size(frame: Any) -> tuple[int, int]:
-    """(height, width) with square pixels after the turn that the film's display matrix asks for."""
-    aspect = frame.sample_aspect_ratio if hasattr(frame, "sample_aspect_ratio") else None
-    size = (frame.height, round(frame.width * float(aspect)) if aspect else frame.width)
-    return size[::-1] if _is_transposed(_display_matrix(frame)) else size
-
-
-def _pixels(frame: Any, size: tuple[int, int]) -> np.ndarray:
-    """RGB, uint8, of the upright size."""
-    matrix = _display_matrix(frame)
-    height, width = size[::-1] if _is_transposed(matrix) else size
+def _pixels(frame: Any, display: Display) -> np.ndarray:
+    """RGB as shown: uint8 [h, w, 3]."""
+    height, width = display.size[::-1] if display.transposed else display.size
     array = frame.reformat(width=width, height=height, format="rgb24", src_colorspace=_colour_matrix(frame)).to_ndarray()
-    array = array.swapaxes(0, 1) if _is_transposed(matrix) else array
-    if matrix[0, 0] + matrix[1, 0] < 0:
-        array = array[:, ::-1]
-    if matrix[0, 1] + matrix[1, 1] < 0:
-        array = array[::-1]
-    return np.ascontiguousarray(array)
-
-
-def _display_matrix(frame: Any) -> np.ndarray:
-    """The 2 x 2 part M of the film's display matrix, by which a stored place (x, y) is shown at (x, y) @ M; the identity without."""
-    import av
-
-    data = frame.side_data.get(av.sidedata.sidedata.Type.DISPLAYMATRIX)
-    if data is None:
-        return np.eye(2)
-    return np.frombuffer(bytes(data), dtype=np.int32).reshape(3, 3)[:2, :2] / 2**16
-
-
-def _is_transposed(matrix: np.ndarray) -> bool:
-    return abs(matrix[0, 1]) + abs(matrix[1, 0]) > abs(matrix[0, 0]) + abs(matrix[1, 1])
+    array = array.swapaxes(0, 1) if display.transposed else array
+    right, down = display.matrix.sum(axis=0)  # of each column one number counts for turns by quarters
+    return np.ascontiguousarray(array[:: 1 if down >= 0 else -1, :: 1 if right >= 0 else -1])
 
 
 def _colour_matrix(frame: Any) -> int:
