@@ -66,8 +66,16 @@ def train(
     minutes: float | None = None,
     device: str | None = None,
     half: bool = True,
+    precision: Literal["float32", "bfloat16"] | None = None,
+    accumulate: int | None = None,
+    recompute: bool = False,
+    shard: bool = False,
+    sheet_every: int | None = None,
+    keep: int | None = None,
+    tensorboard: bool = False,
+    dry_run: bool = False,
 ) -> None:
-    """Train a model from scratch; the same command again goes on where the last one ended.
+    """Train a model from scratch; the same command again goes on where the last one ended. Under torchrun on many devices.
 
     Args:
         preset: What to train, e.g. rooms-tiny (the bundled model).
@@ -77,10 +85,21 @@ def train(
         minutes: Stop after so many minutes; a transformer that is not done by then is exported as it is.
         device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
         half: Store the model in half precision (the raymap autoencoder never is).
+        precision: Of matrix products and convolutions instead of the preset's; weights stay in float32.
+        accumulate: Parts that each process does its share of a batch in, one after the other, to save memory.
+        recompute: Keep no activations inside blocks, to save memory for a third more time.
+        shard: Spread the transformer's weights over the processes (FSDP).
+        sheet_every: Steps between sample sheets of an unseen room.
+        keep: Checkpoints kept.
+        tensorboard: Also write TensorBoard's files.
+        dry_run: Only say sizes, memory and speed of the stages here, measured in a few steps; nothing is written.
     """
     from method_configs.training_command import train_preset
 
-    train_preset(preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half)
+    train_preset(
+        preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half, precision=precision, accumulate=accumulate,
+        recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run,
+    )  # fmt: skip
 
 
 def convert(

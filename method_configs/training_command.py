@@ -1,20 +1,31 @@
-"""``fillerbuster train``: a preset's stages one after the other with a progress bar, then the exported model folder."""
+"""``fillerbuster train``: a preset's stages one after the other, then the exported model folder; on one process or many.
+
+Nothing but fb_core and torch is needed here, so that a bare GPU machine can train (`method_configs.train` is its entrance).
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import importlib.util
 import logging
 import math
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fb_core.training.loop import Run
+from fb_core.training.distributed import Group, joined
+from fb_core.training.dry_run import Cost, measure
+from fb_core.training.loop import EngineConfig, OnProgress
 from fb_core.training.recipe import STAGES, Recipe, export, run_stage
 from method_configs.ablations import PRESETS
 
 _logger = logging.getLogger(__name__)
+_SECONDS_BETWEEN_LINES = 30.0
+GIB = 2**30
 
 
 def train_preset(
@@ -26,30 +37,71 @@ def train_preset(
     minutes: float | None = None,
     device: str | None = None,
     half: bool = True,
+    precision: str | None = None,
+    accumulate: int | None = None,
+    recompute: bool = False,
+    shard: bool = False,
+    sheet_every: int | None = None,
+    keep: int | None = None,
+    tensorboard: bool = False,
+    dry_run: bool = False,
 ) -> Path | None:
     """Train what is not trained yet and export; returns the model's folder, or None while stages are missing.
 
     Stages end in order: when the time is up in one, those after it are not begun, because the transformer learns the latents of
-    finished autoencoders. Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive.
+    finished autoencoders. Options of the engine that are None or False are the preset's. Under torchrun all its processes train together.
+
+    Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive. SystemExit when a signal
+    ended it, after a checkpoint.
     """
     recipe = _recipe(preset)
-    _require_positive(steps=steps, minutes=minutes)
-    where = _device(device)
-    until = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    for name in STAGES if stage == "all" else (stage,):
+    _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
+    stages = STAGES if stage == "all" else (stage,)
+    chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
+    flags = {"recompute": recompute, "shard": shard, "tensorboard": tensorboard}
+    changes = {name: value for name, value in chosen.items() if value is not None} | {name: True for name, value in flags.items() if value}
+    engine = dataclasses.replace(recipe.engine, **changes)
+    with joined(_device(device)) as (group, where):
+        if dry_run:
+            for name in stages:
+                _say(group, "%s", _told(name, measure(recipe, name, device=where, engine=engine, group=group)))
+            return None
+        if not _train_stages(recipe, stages, output, where, steps, math.inf if minutes is None else minutes, engine, group):
+            return None
+        if group.is_main:
+            export(recipe, output, output / "model", dtype=torch.float16 if half else torch.float32)
+        return output / "model"
+
+
+def _train_stages(
+    recipe: Recipe,
+    stages: tuple[str, ...],
+    output: Path,
+    device: torch.device,
+    steps: int | None,
+    minutes: float,
+    engine: EngineConfig,
+    group: Group,
+) -> bool:
+    """Whether every stage has been trained, if only in part."""
+    until = time.monotonic() + 60 * minutes
+    for name in stages:
         if _steps_done(output / name) >= (steps or _steps_planned(recipe, name)):
-            _logger.info("%s is trained already", name)
+            _say(group, "%s is trained already", name)
             continue
-        if time.monotonic() >= until:
+        if group.any(time.monotonic() >= until):
             break
-        run = _train_stage(recipe, name, output, where, steps, (until - time.monotonic()) / 60)
+        left = (until - time.monotonic()) / 60
+        with _progress(name, group) as show:
+            run = run_stage(recipe, name, output, device=device, steps=steps, minutes=left, on_progress=show, engine=engine, group=group)
+        if run.signal:
+            _say(group, "%s stopped by signal %d at step %d of %d, which is saved; the same command goes on from there",
+                 name, run.signal, run.step, run.config.steps)  # fmt: skip
+            sys.exit(128 + run.signal)
         if run.step < run.config.steps:
-            _logger.info("%s stopped at step %d of %d; the same command goes on from there", name, run.step, run.config.steps)
+            _say(group, "%s stopped at step %d of %d; the same command goes on from there", name, run.step, run.config.steps)
             break
-    if not all(_steps_done(output / name) for name in STAGES):
-        return None
-    export(recipe, output, output / "model", dtype=torch.float16 if half else torch.float32)
-    return output / "model"
+    return all(_steps_done(output / name) for name in STAGES)
 
 
 def _recipe(preset: str) -> Recipe:
@@ -88,16 +140,60 @@ def _device(name: str | None) -> torch.device:
     return device
 
 
-def _train_stage(recipe: Recipe, stage: str, folder: Path, device: torch.device, steps: int | None, minutes: float) -> Run:
+def _say(group: Group, message: str, *values: object) -> None:
+    if group.is_main:
+        _logger.info(message, *values)
+
+
+def _told(stage: str, cost: Cost) -> str:
+    """A stage's cost in one line."""
+    sizes = ", ".join(f"{name} {count / 1e6:.1f} M" for name, count in cost.parameters.items())
+    return (
+        f"{stage}: parameters {sizes}; memory {(cost.weight_bytes + cost.step_bytes) / GIB:.2f} GiB "
+        f"(weights and average {cost.weight_bytes / GIB:.2f}, a step {cost.step_bytes / GIB:.2f}); "
+        f"{cost.steps_per_second:.3g} steps per second, {100 * cost.data_share:.0f} % of the time for data; "
+        f"{cost.flops:.3g} FLOPs per step, {100 * cost.utilisation:.0f} % of what a matrix product reaches here"
+    )
+
+
+@contextlib.contextmanager
+def _progress(stage: str, group: Group) -> Iterator[OnProgress | None]:
+    """A bar where a person watches, a line in the log now and then elsewhere; for the first process only."""
+    if not group.is_main:
+        yield None
+    elif sys.stderr.isatty() and importlib.util.find_spec("rich") is not None:
+        with _bar(stage) as show:
+            yield show
+    else:
+        yield _lines(stage)
+
+
+def _losses(losses: dict[str, float]) -> str:
+    return "  ".join(f"{name} {value:.4g}" for name, value in losses.items())
+
+
+@contextlib.contextmanager
+def _bar(stage: str) -> Iterator[OnProgress]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[losses]}"),
     )  # fmt: skip
     with Progress(*columns) as progress:
         bar = progress.add_task(stage, total=None, losses="")
+        yield lambda done, total, losses: progress.update(bar, completed=done, total=total, losses=_losses(losses))
 
-        def show(done: int, total: int, losses: dict[str, float]) -> None:
-            told = "  ".join(f"{name} {value:.4g}" for name, value in losses.items())
-            progress.update(bar, completed=done, total=total, losses=told)
 
-        return run_stage(recipe, stage, folder, device=device, steps=steps, minutes=minutes, on_progress=show)
+def _lines(stage: str) -> OnProgress:
+    last_time, last_step = time.monotonic(), None
+
+    def show(done: int, total: int, losses: dict[str, float]) -> None:
+        nonlocal last_time, last_step
+        last_step = done - 1 if last_step is None else last_step
+        passed = time.monotonic() - last_time
+        if passed >= _SECONDS_BETWEEN_LINES or done == total:
+            _logger.info("%s: step %d of %d, %.3g steps per second, %s", stage, done, total, (done - last_step) / passed, _losses(losses))
+            last_time, last_step = time.monotonic(), done
+
+    return show

@@ -100,7 +100,7 @@ def averaging(module: nn.Module, group: Group, *, sharded: bool) -> nn.Module:
     """The module whose backward pass averages gradients over all processes."""
     if group.size == 1 or sharded:  # sharded networks average by themselves
         return module
-    return DistributedDataParallel(module, broadcast_buffers=False, gradient_as_bucket_view=True)
+    return DistributedDataParallel(module, gradient_as_bucket_view=True)
 
 
 @contextlib.contextmanager

@@ -225,15 +225,16 @@ class Run:
             if group.is_main:
                 self._log = ProgressLog(folder, stage.name, from_step=self.step, tensorboard=engine.tensorboard)
 
-    def train(self, *, on_progress: OnProgress | None = None, minutes: float = math.inf) -> None:
-        """Go on to the last step, or until the time is up or a signal asks to stop; saves now and then and at the end.
+    def train(self, *, on_progress: OnProgress | None = None, minutes: float = math.inf, at_most: int | None = None) -> None:
+        """Go on to the last step, or for ``at_most`` steps, or until the time is up or a signal comes; saves now and then and at the end.
 
         Raises FloatingPointError when a loss or gradient is not finite; the last checkpoint then still holds the last good state.
         """
         until = time.monotonic() + 60 * minutes
+        last = self.config.steps if at_most is None else min(self.config.steps, self.step + at_most)
         self.stage.network.train()
         with StopSignal() as stop, ThreadPoolExecutor(1) as ahead:
-            while self.step < self.config.steps and not self.group.any(bool(stop.number) or time.monotonic() >= until):
+            while self.step < last and not self.group.any(bool(stop.number) or time.monotonic() >= until):
                 started = time.monotonic()
                 losses = self._one_step(ahead)
                 self.seconds += time.monotonic() - started

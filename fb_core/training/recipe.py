@@ -18,9 +18,11 @@ from fb_core.data.sequences import PoolConfig, RoomPool
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.sampler import SamplingConfig
+from fb_core.training.distributed import ALONE, Group
 from fb_core.training.dit_stage import DiTLossConfig, DiTStage
 from fb_core.training.linear_start import start_linear
-from fb_core.training.loop import LoopConfig, OnProgress, Run
+from fb_core.training.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
+from fb_core.training.sample_sheets import reconstruction_sheet, room_sheet
 from fb_core.training.vae_stage import VAELossConfig, VAEStage, reconstruction_error
 
 STAGES = ("image-vae", "raymap-vae", "dit")
@@ -57,6 +59,8 @@ class Recipe:
     """Loss and task of the transformer."""
     sampling: SamplingConfig = SamplingConfig()
     """How the finished model samples best; its folder says so."""
+    engine: EngineConfig = EngineConfig()
+    """How a machine trains it, unless the command says otherwise."""
     seed: int = 0
     """Decides rooms, weights and every draw."""
 
@@ -70,39 +74,75 @@ def run_stage(
     steps: int | None = None,
     minutes: float = math.inf,
     on_progress: OnProgress | None = None,
+    engine: EngineConfig | None = None,
+    group: Group = ALONE,
 ) -> Run:
     """Train one stage in ``folder/stage`` (resuming what is there). The transformer needs both autoencoders of the same folder.
 
+    ``engine`` replaces the recipe's. All processes of a group call this, and see the same folder.
+
     Raises ValueError for an unknown stage, and for a transformer whose autoencoders are not there yet.
     """
+    task, loop = make_stage(recipe, stage, folder, device=device)
+    loop = loop if steps is None else dataclasses.replace(loop, steps=steps)
+    engine = engine or recipe.engine
+    on_sheet = make_sheet(recipe, task) if engine.sheet_every and group.is_main else None
+    run = Run(task, loop, folder / stage, preset=recipe.name, engine=engine, group=group, on_sheet=on_sheet)
+    run.train(on_progress=on_progress if group.is_main else None, minutes=minutes)
+    if isinstance(task, VAEStage) and not run.signal:
+        averaged = run.averaged_state()
+        if group.is_main:
+            task.pool.advance(max(0, run.step - 1))  # the pool of a run that was finished already is still empty
+            _record_spread(task, averaged, folder / stage)
+        group.wait()
+    return run
+
+
+def make_stage(
+    recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu"
+) -> tuple[VAEStage | DiTStage, LoopConfig]:
+    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born."""
     if stage not in STAGES:
         raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")
-    if stage == "dit":
-        image_vae, raymap_vae = (trained_vae(recipe, kind, folder, device) for kind in STAGES[:2])
-        pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, encode=lambda images: encode_in_chunks(image_vae, images, 64))
-        network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device)
-        task, loop = (
-            DiTStage(network, image_vae=image_vae, raymap_vae=raymap_vae, pool=pool, config=recipe.dit_loss, seed=recipe.seed),
-            recipe.dit_loop,
-        )
-    else:
-        config = recipe.image_vae if stage == "image-vae" else recipe.raymap_vae
-        loss = recipe.image_vae_loss if stage == "image-vae" else recipe.raymap_vae_loss
-        with torch.random.fork_rng():
-            torch.manual_seed(recipe.seed)
-            network = VAE(config)
-        if config.norm == "none":
-            start_linear(network, torch.Generator().manual_seed(recipe.seed))
-        network.to(device)
-        pool = RoomPool(recipe.vae_pool, seed=recipe.seed + 1, device=device, with_images=stage == "image-vae")
-        task = VAEStage(network, pool, kind=stage, config=loss, seed=recipe.seed)
-        loop = recipe.image_vae_loop if stage == "image-vae" else recipe.raymap_vae_loop
-    run = Run(task, loop if steps is None else dataclasses.replace(loop, steps=steps), folder / stage)
-    run.train(on_progress=on_progress, minutes=minutes)
+    if stage != "dit":
+        return _vae_stage(recipe, stage, device)
+    image_vae, raymap_vae = (
+        _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device) for kind in STAGES[:2]
+    )
+    pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, encode=lambda images: encode_in_chunks(image_vae, images, 64))
+    network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device)
+    task = DiTStage(network, image_vae=image_vae, raymap_vae=raymap_vae, pool=pool, config=recipe.dit_loss, seed=recipe.seed)
+    return task, recipe.dit_loop
+
+
+def make_sheet(recipe: Recipe, task: VAEStage | DiTStage) -> OnSheet:
+    """What draws a stage's sample sheets: an unseen room, reconstructed by an autoencoder or completed by the transformer."""
+    family, views, size = recipe.pool.families[-1], recipe.dit_loss.task.views, recipe.pool.image_size
     if isinstance(task, VAEStage):
-        pool.advance(max(0, run.step - 1))  # the pool of a run that was finished already is still empty
-        _record_spread(task, run.averaged_state(), folder / stage)
-    return run
+        return reconstruction_sheet(task.network.config, family=family, views=views, size=size, device=_device_of(task))
+    vaes = {"image_vae": task.image_vae, "raymap_vae": task.raymap_vae}
+    return room_sheet(recipe.dit, **vaes, family=family, views=views, size=size, sampling=recipe.sampling, device=_device_of(task))
+
+
+def _device_of(task: VAEStage | DiTStage) -> torch.device:
+    return next(task.network.parameters()).device
+
+
+def _vae_stage(recipe: Recipe, kind: str, device: torch.device | str) -> tuple[VAEStage, LoopConfig]:
+    loss, loop = {
+        "image-vae": (recipe.image_vae_loss, recipe.image_vae_loop),
+        "raymap-vae": (recipe.raymap_vae_loss, recipe.raymap_vae_loop),
+    }[kind]
+    pool = RoomPool(recipe.vae_pool, seed=recipe.seed + 1, device=device, with_images=kind == "image-vae")
+    return VAEStage(_new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed), loop
+
+
+def _new_vae(recipe: Recipe, kind: str) -> VAE:
+    config = recipe.image_vae if kind == "image-vae" else recipe.raymap_vae
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        network = VAE(config)
+    return start_linear(network, torch.Generator().manual_seed(recipe.seed)) if config.norm == "none" else network
 
 
 def trained_vae(recipe: Recipe, kind: str, folder: Path, device: torch.device | str = "cpu") -> VAE:

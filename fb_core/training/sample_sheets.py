@@ -1,0 +1,86 @@
+"""Sample sheets of a training: what the averaged weights make of an unseen room. They draw nothing that the training draws."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from fb_core.checkpoint import Loaded, ModelConfig
+from fb_core.conditioning import encode_in_chunks
+from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
+from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.vae import VAE, VAEConfig
+
+_logger = logging.getLogger(__name__)
+_DPI = 80
+_Network = TypeVar("_Network", DiT, VAE)
+Sheet = Callable[[Path, dict[str, Tensor]], None]
+
+
+def room_sheet(
+    config: DiTConfig,
+    *,
+    image_vae: VAE,
+    raymap_vae: VAE,
+    family: str,
+    views: int,
+    size: int,
+    sampling: SamplingConfig,
+    device: torch.device,
+) -> Sheet:
+    """Sheets of the transformer: the second half of an unseen room's views, completed from the first half."""
+
+    def draw(path: Path, state: dict[str, Tensor]) -> None:
+        from fb_core.evaluation.completion import complete_hidden, unseen_room
+
+        architecture = ModelConfig(transformer=config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
+        dit = _with_weights(DiT(config), state, device)
+        model = Fillerbuster(Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=architecture))
+        room = unseen_room(family=family, seed=0, number=0, views=views, size=size)
+        known = max(1, views // 2)
+        given, hidden = room[:known], room[known:]
+        completed = complete_hidden(model, given, hidden.cameras, sampling, seed=0)
+        _write(path, {"Known": given.images, "Generated": completed, "Truth": hidden.images})
+
+    return draw
+
+
+def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> Sheet:
+    """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after."""
+
+    def draw(path: Path, state: dict[str, Tensor]) -> None:
+        from fb_core.evaluation.completion import unseen_room
+
+        network = _with_weights(VAE(config), state, device)
+        room = unseen_room(family=family, seed=0, number=0, views=views, size=size)
+        is_image = config.in_channels == 3
+        values = room.images if is_image else to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+        with torch.no_grad():
+            decoded = network.decode(encode_in_chunks(network, values.to(device), 16))
+        rows = {"Truth": values, "Reconstructed": decoded}
+        _write(path, rows if is_image else {f"{name} directions": value[:, 3:] for name, value in rows.items()})
+
+    return draw
+
+
+def _with_weights(network: _Network, state: dict[str, Tensor], device: torch.device) -> _Network:
+    network.load_state_dict(state)
+    return network.to(device).eval().requires_grad_(False)
+
+
+def _write(path: Path, rows: dict[str, Tensor]) -> None:
+    """One strip of pictures per row; where matplotlib is missing, a line in the log instead."""
+    if importlib.util.find_spec("matplotlib") is None:
+        _logger.info("no %s, because matplotlib is not installed", path.name)
+        return
+    from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
+
+    strips = [Strip(heading=heading, pictures=list(pictures)) for heading, pictures in rows.items()]
+    write_contact_sheet(path, strips, title=f"Step {int(path.stem)}", subtitle="an unseen room, by the averaged weights", dpi=_DPI)
