@@ -243,10 +243,10 @@ def _counting() -> Iterator[dict[str, int]]:
     """Counts the pairs (Gaussian, pixel) of forward passes inside the block by watching the compositor's blocks go by."""
     pairs, composited = {"evaluated": 0, "drawn": 0}, torch_compositing._forward_block
 
-    def counted(block: torch_compositing.Block, image: Tensor, scratch: Any) -> None:
+    def counted(block: torch_compositing.Block, image: Tensor) -> None:
         pairs["evaluated"] += block.alpha.numel()
         pairs["drawn"] += int(torch.count_nonzero(block.alpha))
-        composited(block, image, scratch)
+        composited(block, image)
 
     torch_compositing._forward_block = counted
     try:

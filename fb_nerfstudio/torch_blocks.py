@@ -18,10 +18,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses
@@ -29,8 +28,9 @@ from fb_nerfstudio.torch_projection import ALPHA_MIN
 
 TRANSMITTANCE_MIN = 1e-4
 TERMS, GEOMETRY, COLUMNS = 6, 6, 11
-# Shape of a block, found by measuring: 16 ranks x 256 cells x 64 pixels, deeper where there are fewer cells.
-PAIRS_PER_BLOCK = 2**18
+# Shape of a block, found by measuring: 16 ranks x 500 cells x 64 pixels, deeper where there are fewer cells. No power of two, or the
+# ranks of a cell would lie a multiple of 4096 bytes apart, where a cache has room for eight of them.
+PAIRS_PER_BLOCK = 500 * 1024
 _SHALLOWEST = 16
 # A layer (one rank) with fewer values than this is scanned by torch; larger layers are walked one by one, which is faster.
 THIN = 512
@@ -51,27 +51,37 @@ class Table:
     centers: Float[Tensor, "2 cells"]
     alpha_threshold: float
     """The largest number below 1/255."""
-    cap: float | None
-    """Largest alpha; None where no opacity reaches it."""
+    cap: float
+    """Largest alpha."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """Where a block lies: all that it takes to evaluate it (again). 20 bytes a row, where a row of the block has 256 in each tensor."""
+
+    depth: int
+    splats: Int32[Tensor, " bs"]
+    """Rows of the table; padding points at some row and has alpha 0."""
+    padding: Bool[Tensor, "b s"] | None
+    light: Float[Tensor, "s p"]
+    """Transmittance in front of the block."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
     """B ranks deep, S cells wide, P pixels each; where two of them are one index the order is (b, s)."""
 
-    splats: Int32[Tensor, " bs"]
-    """Rows of the table; padding points at some row and has alpha 0."""
     columns: Float[Tensor, "11 bs"]
     """Coefficients k0 .. k5, dx and dy (mean less cell centre), A, B, C: to the base 2 like the table."""
-    clear: Float[Tensor, "b s p"]
-    """1 - alpha before the stop."""
     values: Float[Tensor, "b s d1"]
     """Channels, and a last one of ones, which composites to alpha."""
     alpha: Float[Tensor, "b s p"]
-    light: Float[Tensor, "b s p"]
-    """Transmittance in front of each."""
-    capped: Tensor | None
-    """Pairs at the cap (bool), or None where there are none."""
+    weights: Float[Tensor, "b s p"]
+    """alpha times the transmittance in front."""
+    behind: Float[Tensor, "s p"]
+    """Transmittance behind the block, as if nothing had stopped."""
+    capped: Bool[Tensor, "b s p"] | None
+    """Pairs at the cap, or None where there are none."""
 
 
 class Scratch:
@@ -81,6 +91,7 @@ class Scratch:
         self._like = like
         self._buffers: dict[str, Tensor] = {}
         self._views: dict[tuple[str | int, ...], Tensor] = {}
+        self._layers: dict[tuple[str | int, ...], tuple[Tensor, ...]] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
         view = self._views.get((name, *shape))
@@ -89,8 +100,17 @@ class Scratch:
             if name not in self._buffers or self._buffers[name].numel() < size:
                 self._buffers[name] = self._like.new_zeros(size)
                 self._views = {key: value for key, value in self._views.items() if key[0] != name}
+                self._layers = {key: value for key, value in self._layers.items() if key[0] != name}
             view = self._views[(name, *shape)] = self._buffers[name][:size].view(shape)
         return view
+
+    def layers(self, name: str, *shape: int, axis: int = 0) -> tuple[Tensor, ...]:
+        """`take(...)` cut along an axis, always the same for a name. Kept as well: making a view costs as much as a pass over a layer."""
+        whole = self.take(name, *shape)
+        layers = self._layers.get((name, *shape))
+        if layers is None:
+            layers = self._layers[(name, *shape)] = whole.unbind(axis)
+        return layers
 
 
 def padded(width: int) -> int:
@@ -113,8 +133,6 @@ def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> 
     torch.stack([ellipses.opacity.log2(), ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :GEOMETRY])
     rows[:, GEOMETRY : used - 1] = values
     rows[:, used - 1 :] = 1.0
-    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
-    may_cap = values.shape[0] > 0 and float(ellipses.opacity.max()) > cap * (1 - 1e-3)
     return Table(
         rows=rows,
         channels=values.shape[1] + 1,
@@ -122,7 +140,7 @@ def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> 
         halves=values.new_tensor([[-0.5], [-1.0], [-0.5]]),
         centers=torch.stack(grid.centers(values)),
         alpha_threshold=float(below),
-        cap=cap if may_cap else None,
+        cap=cap,
     )
 
 
@@ -131,6 +149,8 @@ class Stretch:
 
     def __init__(self, cells: Tensor, counts: Tensor, starts: Tensor, rank: int):
         self.cells = cells
+        self.steps: list[Step] = []
+        """`steps`: where the blocks were, once they have been walked."""
         self.rest: Stretch | None = None
         """`rest`: after `blocks`, the stretch of the cells that still need work, or None."""
         self._counts, self._starts, self._rank = counts, starts, rank
@@ -139,21 +159,20 @@ class Stretch:
     def blocks(self, table: Table, listed: Tensor, transmittance: Tensor, scratch: Scratch, budget: int) -> Iterator[Block]:
         """The blocks in order, covering the first cells of the stretch; at the end their transmittance [cells, p] is up to date."""
         pixels, rank, lengths = table.monomials.shape[1], self._rank, self._counts.tolist()
-        centers = table.centers.index_select(1, self.cells)[:, None]
+        centers = self._centers(table)
         light, deepest, width = transmittance.index_select(0, self.cells), lengths[0], len(lengths)
         while rank < deepest:
             while lengths[width - 1] <= rank:  # long lists come first, so finished cells are at the end
                 width -= 1
             depth = min(max(_SHALLOWEST, budget // (width * pixels)), deepest - rank)
             splats, padding = self._pick(listed, rank, depth, width, full=lengths[width - 1] >= rank + depth)
-            block, after = _block(table, splats, padding, centers[..., :width], light[:width], depth, scratch)
-            light[:width] = after[-1]
+            step = Step(depth=depth, splats=splats, padding=padding, light=light[:width].clone())
+            self.steps.append(step)
+            block = _evaluate(table, step, centers, scratch)
+            light[:width] = block.behind
             rank += depth
-            opaque = float(after[-1].min()) <= TRANSMITTANCE_MIN
-            if opaque:
-                _stop(block.alpha, after, scratch)
             yield block
-            if opaque and rank < deepest:
+            if rank < deepest and float(block.behind.min()) <= TRANSMITTANCE_MIN:
                 still = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
                 if int(still.sum()) <= 0.75 * width:
                     kept = still.nonzero()[:, 0]
@@ -162,6 +181,15 @@ class Stretch:
                         self.rest = Stretch(cells, counts, starts, rank)
                     break
         transmittance.index_copy_(0, self.cells, light)
+
+    def blocks_again(self, table: Table, scratch: Scratch) -> Iterator[tuple[Step, Block]]:
+        """The blocks that have been walked, last one first."""
+        centers = self._centers(table)
+        for step in reversed(self.steps):
+            yield step, _evaluate(table, step, centers, scratch)
+
+    def _centers(self, table: Table) -> Float[Tensor, "2 1 s"]:
+        return table.centers.index_select(1, self.cells)[:, None]
 
     def _pick(self, listed: Tensor, rank: int, depth: int, width: int, full: bool) -> tuple[Tensor, Tensor | None]:
         """Table rows of the ranks rank .. rank + depth of the first `width` cells, and what of it is padding."""
@@ -173,50 +201,56 @@ class Stretch:
         return listed.index_select(0, positions.view(-1)), padding
 
 
-def _block(
-    table: Table, splats: Tensor, padding: Tensor | None, centers: Tensor, light: Tensor, depth: int, scratch: Scratch
-) -> tuple[Block, Tensor]:
-    """Evaluate all pairs; also returns the transmittance behind each [b, s, p]."""
-    width, pixels = light.shape
-    rows = torch.index_select(table.rows, 0, splats, out=scratch.take("rows", depth * width, table.rows.shape[1]))
+def _evaluate(table: Table, step: Step, centers: Float[Tensor, "2 1 s"], scratch: Scratch) -> Block:
+    """All pairs of a block; it lives in `scratch`, until the next one is evaluated."""
+    depth, (width, pixels) = step.depth, step.light.shape
+    rows = torch.index_select(table.rows, 0, step.splats, out=scratch.take("rows", depth * width, table.rows.shape[1]))
     k = scratch.take("columns", COLUMNS, depth * width)
     k[COLUMNS - GEOMETRY :].copy_(rows[:, :GEOMETRY].t())
-    k[6:8].view(2, depth, width).sub_(centers)
+    # A little slack: the polynomial may round an exponent to slightly above log(opacity).
+    may_cap = float(k[COLUMNS - GEOMETRY].max()) > math.log2(table.cap) - 1e-3
+    k[6:8].view(2, depth, width).sub_(centers[..., :width])
     dx, dy = k[6], k[7]
     torch.mul(k[8:10], dx, out=k[1:3]).addcmul_(k[9:11], dy)
     torch.addcmul(k[5], dx, k[1], value=-0.5, out=k[0]).addcmul_(dy, k[2], value=-0.5)
     torch.mul(k[8:11], table.halves, out=k[3:6])
-    if padding is not None:
-        k[0].masked_fill_(padding.view(-1), _NEVER)
-    alpha = torch.mm(k[:TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
+    if step.padding is not None:
+        k[0].masked_fill_(step.padding.view(-1), _NEVER)
+    alpha = scratch.take("alpha", depth, width, pixels)
+    exponents = torch.mm(k[:TERMS].t(), table.monomials, out=scratch.take("alpha", depth * width, pixels))
     # To the base 2 because torch's exp2 is twice as fast as its exp.
-    alpha = torch.threshold_(alpha.exp2_(), table.alpha_threshold, 0.0).view(depth, width, pixels)
+    torch.threshold_(exponents.exp2_(), table.alpha_threshold, 0.0)
     capped = None
-    if table.cap is not None and float(alpha.max()) > table.cap:
+    if may_cap and float(alpha.max()) > table.cap:
         capped = alpha > table.cap
         alpha.clamp_(max=table.cap)
-    lights = scratch.take("light", depth + 1, width, pixels)
-    lights[0] = light
-    clear = torch.sub(1.0, alpha, out=scratch.take("clear", depth, width, pixels))
-    _darken(clear, lights)
+    weights, lights = scratch.take("weights", depth, width, pixels), scratch.take("light", depth + 1, width, pixels)
+    lights[0] = step.light
+    _darken(alpha, weights, lights, scratch)
+    if float(lights[-1].min()) <= TRANSMITTANCE_MIN:
+        _stop(alpha, lights[1:])
+        _stop(weights, lights[1:])
     values = rows[:, GEOMETRY : GEOMETRY + table.channels].view(depth, width, -1)
-    return Block(splats=splats, columns=k, values=values, alpha=alpha, clear=clear, light=lights[:depth], capped=capped), lights[1:]
+    return Block(columns=k, values=values, alpha=alpha, weights=weights, behind=lights[depth], capped=capped)
 
 
-def _darken(clear: Tensor, lights: Tensor) -> None:
-    """lights[b + 1] = lights[b] clear[b]."""
-    if clear[0].numel() < THIN:
-        lights[1:] = clear
+def _darken(alpha: Tensor, weights: Tensor, lights: Tensor, scratch: Scratch) -> None:
+    """weights[b] = alpha[b] lights[b], lights[b + 1] = lights[b] - weights[b]; rank by rank, so that a layer stays in the cache."""
+    if lights[0].numel() < THIN:
+        torch.sub(1.0, alpha, out=lights[1:])
         torch.cumprod(lights, dim=0, out=lights)
+        torch.mul(alpha, lights[:-1], out=weights)
         return
-    for through, (before, after) in zip(clear.unbind(0), pairwise(lights.unbind(0)), strict=True):
-        torch.mul(before, through, out=after)
+    before, *behind = scratch.layers("light", *lights.shape)
+    for share, weight, after in zip(scratch.layers("alpha", *alpha.shape), scratch.layers("weights", *weights.shape), behind, strict=True):
+        torch.mul(share, before, out=weight)
+        torch.sub(before, weight, out=after)
+        before = after
 
 
-def _stop(alpha: Tensor, after: Tensor, scratch: Scratch) -> None:
-    """Take out the Gaussian that would end a pixel, and all behind it. In floats: comparisons cost five times as much."""
-    drawn = torch.sub(after, TRANSMITTANCE_MIN, out=scratch.take("drawn", *after.shape))
-    alpha.mul_(drawn.mul_(1e30).clamp_(0.0, 1.0))
+def _stop(values: Tensor, after: Tensor) -> None:
+    """Take out the Gaussian that would end a pixel, and all behind it: 0 where after <= 1e-4, in one pass."""
+    torch.ops.aten.threshold_backward.grad_input(values, after, TRANSMITTANCE_MIN, grad_input=values)
 
 
 def march(lists: CellLists, pixels: int, budget: int) -> Iterator[Stretch]:

@@ -1,14 +1,14 @@
 """Front-to-back alpha compositing of screen ellipses with an analytic gradient (pure torch, bounded memory).
 
-The backward pass walks the blocks of `torch_blocks` front to back once more, nothing is stored: what lies behind a Gaussian is the
-known total less what has been passed. The gradient of a pair is its derivative g by the exponent; sums of g times the monomials
-(one thin matrix product) are moments, from which every gradient follows. A pair above the cap passes no gradient to its exponent.
+The backward pass evaluates the blocks of `torch_blocks` once more, back to front; forward keeps where they were (`Step`), and that only
+for the last slab of a scene whose lists are made slab by slab. The gradient of a pair is its derivative g by the exponent; sums of
+g times the monomials (one thin matrix product) are moments, from which every gradient follows. A pair above the cap passes no
+gradient to its exponent.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -19,10 +19,24 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from fb_nerfstudio.single_thread import single_thread
-from fb_nerfstudio.torch_blocks import PAIRS_PER_BLOCK, TERMS, THIN, TRANSMITTANCE_MIN, Block, Scratch, march, padded, table_of
+from fb_nerfstudio.torch_blocks import (
+    PAIRS_PER_BLOCK,
+    TERMS,
+    TRANSMITTANCE_MIN,
+    Block,
+    Scratch,
+    Step,
+    Stretch,
+    Table,
+    march,
+    padded,
+    table_of,
+)
 from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses, Strips, list_cells, measure_strips, slabs
 
 ROWS_PER_LIST = 2**20
+PULLS = TERMS + 2
+"""Columns of the gradient sums before the values: moments and absolute pulls."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,74 +71,88 @@ def composite(
     return _Composite.apply(means2d, conics, opacities, values, chosen, ellipses, grid, settings)
 
 
-def _forward_block(block: Block, image: Tensor, scratch: Scratch) -> None:
+def _forward_block(block: Block, image: Tensor) -> None:
     """Add the block to the cells [s, d1, p] of its stretch."""
-    weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", *block.alpha.shape))
-    image[: weights.shape[1]].baddbmm_(block.values.permute(1, 2, 0), weights.permute(1, 0, 2))
+    image[: block.weights.shape[1]].baddbmm_(block.values.permute(1, 2, 0), block.weights.permute(1, 0, 2))
 
 
-def _backward_block(block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: Scratch):
-    """Add the block's gradients to `sums` [v, r]; `behind` [s, p], the part of the loss that lies behind, is advanced in place.
+def _backward_block(
+    step: Step, block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: Scratch
+) -> None:
+    """Add the block's gradients to `sums` [v, r]; `behind` [s, p] is brought from what is seen behind the block to what is seen of it.
 
     The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
     """
     depth, width, pixels = block.alpha.shape
     upstream, behind = upstream[:width], behind[:width]
     new = scratch.take("new", depth * width, sums.shape[1])
-    weights = torch.mul(block.alpha, block.light, out=scratch.take("weights", depth, width, pixels))
-    v_values = new[:, TERMS + 2 : TERMS + 2 + upstream.shape[1]].view(depth, width, -1)
-    v_values.copy_(torch.bmm(upstream, weights.permute(1, 2, 0)).permute(2, 0, 1))
-    seen = torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
-    share = weights.mul_(seen.permute(1, 0, 2))
-    rest = scratch.take("rest", depth, width, pixels)
-    _pass_by(behind, share, rest)
-    # d loss / d exponent = alpha T (value . upstream) - alpha / (1 - alpha) * what lies behind
-    g = share.addcmul_(torch.div(block.alpha, block.clear, out=block.clear), rest, value=-1.0)
+    v_values = new[:, PULLS : PULLS + upstream.shape[1] - 1].view(depth, width, -1)
+    v_values.copy_(torch.bmm(upstream[:, :-1], block.weights.permute(1, 2, 0)).permute(2, 0, 1))
+    torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
+    g = _slopes(depth, behind, scratch)
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
-    new[:, :TERMS] = _central_moments(block.columns[6:8], torch.mm(monomials, g.t())).t()
+    columns = scratch.take("moments", PULLS, depth * width)
+    _central_moments(block.columns[6:8], torch.mm(monomials, g.t()), columns[:TERMS])
     if absgrad:
-        new[:, TERMS : TERMS + 2] = _absolute_pulls(block.columns, monomials, g, scratch).t()
-    sums.index_add_(0, block.splats.long(), new)  # several times faster with 64-bit indices
+        _absolute_pulls(block.columns, monomials, g, columns[TERMS:], scratch)
+    new[:, :PULLS] = columns.t()
+    sums.index_add_(0, step.splats.long(), new)  # several times faster with 64-bit indices
 
 
-def _pass_by(behind: Tensor, share: Tensor, rest: Tensor) -> None:
-    """rest[b] = behind - share[0] - .. - share[b]; then `behind` takes the last of these."""
-    if behind.numel() < THIN:
-        torch.sub(behind, torch.cumsum(share, dim=0, out=rest), out=rest)
-        behind.copy_(rest[-1])
-        return
-    front = behind
-    for part, remaining in zip(share.unbind(0), rest.unbind(0), strict=True):
-        front = torch.sub(front, part, out=remaining)
-    behind.copy_(front)
+def _slopes(depth: int, behind: Float[Tensor, "s p"], scratch: Scratch) -> Float[Tensor, "b s p"]:
+    """g = d loss / d exponent = alpha T (seen - behind): what one sees of the Gaussian, less what one would see without it.
+
+    Whoever looks at a Gaussian sees alpha of it and 1 - alpha of what is `behind`, which is brought from the last rank to the first:
+    no division, no difference of large numbers. Reads `seen` and the block from scratch, rank by rank like `_darken`.
+    """
+    shape = depth, *behind.shape
+    slopes, seen = scratch.layers("slopes", *shape), scratch.layers("seen", shape[1], depth, shape[2], axis=1)
+    shares, weights = scratch.layers("alpha", *shape), scratch.layers("weights", *shape)
+    for rank in reversed(range(depth)):
+        torch.sub(seen[rank], behind, out=slopes[rank])
+        behind.addcmul_(shares[rank], slopes[rank])
+        slopes[rank].mul_(weights[rank])
+    return scratch.take("slopes", *shape)
 
 
-def _central_moments(d: Float[Tensor, "2 bs"], local: Float[Tensor, "6 bs"]) -> Float[Tensor, "6 bs"]:
+def _central_moments(d: Float[Tensor, "2 bs"], local: Float[Tensor, "6 bs"], out: Float[Tensor, "6 bs"]) -> None:
     """Shift sums of g times monomials of (u, v) about the cell centre to (x, y) = d - (u, v) about the mean: 1, x, y, xx, xy, yy."""
-    total, offsets, cross = local[0], local[1:3], local[4]
-    first = (d * total).sub_(offsets)
-    squares = (first - offsets).mul_(d).add_(local[3::2])
-    mixed = (d[0] * first[1]).addcmul_(d[1], offsets[0], value=-1.0).add_(cross)
-    return torch.stack([total, first[0], first[1], squares[0], mixed, squares[1]])
+    total, offsets, first = local[0], local[1:3], out[1:3]
+    out[0] = total
+    torch.mul(d, total, out=first).sub_(offsets)
+    torch.sub(first, offsets, out=out[3::2]).mul_(d).add_(local[3::2])
+    torch.addcmul(local[4], d[0], first[1], out=out[4]).addcmul_(d[1], offsets[0], value=-1.0)
 
 
-def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, scratch: Scratch) -> Float[Tensor, "2 bs"]:
+def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, out: Float[Tensor, "2 bs"], scratch: Scratch) -> None:
     """Sums over pixels of |g| |conic d|, the gradient of the mean before its signs cancel; conic d is linear in (u, v). Uses g up."""
-    size, sums = g.abs_(), []
-    for constant, along_u, along_v in ((1, 8, 9), (2, 9, 10)):
+    size = g.abs_()
+    for total, (constant, along_u, along_v) in zip(out.unbind(0), ((1, 8, 9), (2, 9, 10)), strict=True):
         line = torch.stack([columns[constant], -columns[along_u], -columns[along_v]])
-        pull = torch.mm(line.t(), monomials[:3], out=scratch.take("rest", *g.shape))
-        sums.append(pull.abs_().mul_(size).sum(dim=1))
-    return torch.stack(sums).mul_(math.log(2.0))
+        pull = torch.mm(line.t(), monomials[:3], out=scratch.take("weights", *g.shape))
+        torch.sum(pull.abs_().mul_(size), dim=1, out=total).mul_(math.log(2.0))
 
 
-def _lists(ellipses: Ellipses, strips: Strips, grid: CellGrid, budget: int, transmittance: Tensor) -> Iterator[CellLists]:
-    """The lists slab by slab, without the cells that the slabs before have made opaque."""
-    for run in slabs(strips, budget):
-        alive = (transmittance.amax(dim=1) > TRANSMITTANCE_MIN) if run[0] else None
-        yield list_cells(ellipses, strips, run, grid, alive)
+def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, transmittance: Tensor | None) -> CellLists:
+    """The lists of one slab, without the cells that the slabs before have made opaque."""
+    alive = None if transmittance is None else transmittance.amax(dim=1) > TRANSMITTANCE_MIN
+    return list_cells(ellipses, strips, run, grid, alive)
+
+
+def _walk(
+    table: Table, ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, start: Tensor | None,
+    settings: CompositingSettings, scratch: Scratch,
+) -> list[Stretch]:  # fmt: skip
+    """The stretches of one slab, walked once more for where their blocks are."""
+    lists, walked = _lists(ellipses, strips, run, grid, start), []
+    transmittance = table.rows.new_ones(grid.count, grid.size * grid.size) if start is None else start.clone()
+    for stretch in march(lists, transmittance.shape[1], settings.pairs_per_block):
+        for _ in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
+            pass
+        walked.append(stretch)
+    return walked
 
 
 def _plane(cells: Tensor, grid: CellGrid) -> Tensor:
@@ -157,36 +185,43 @@ class _Composite(torch.autograd.Function):
             pixels = grid.size * grid.size
             image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
             transmittance = values.new_ones(grid.count, pixels)
-            for lists in _lists(ellipses, strips, grid, settings.rows_per_list, transmittance):
+            walked, starts = [], []
+            for run in slabs(strips, settings.rows_per_list):
+                starts.append((run, transmittance.clone() if run[0] else None))
+                walked.clear()
+                lists = _lists(ellipses, strips, run, grid, starts[-1][1])
                 for stretch in march(lists, pixels, settings.pairs_per_block):
                     local = image.new_zeros(stretch.cells.shape[0], *image.shape[1:])
                     for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
-                        _forward_block(block, local, scratch)
+                        _forward_block(block, local)
                     image.index_add_(0, stretch.cells, local)
+                    walked.append(stretch)
             colors, alphas = _to_image(image[:, :-1], grid), _to_image(image[:, -1:], grid)
-        ctx.save_for_backward(means2d, conics, opacities, values, chosen, image)
-        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
+        ctx.save_for_backward(means2d, conics, opacities, values, chosen)
+        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings, ctx.walked, ctx.starts = ellipses, strips, grid, settings, walked, starts
         return colors, alphas
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_colors, v_alphas):
-        means2d, conics, opacities, values, chosen, image = ctx.saved_tensors
+        means2d, conics, opacities, values, chosen = ctx.saved_tensors
         ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
         with single_thread():
             table, scratch = table_of(ellipses, values, grid, settings.alpha_cap), Scratch(values)
             upstream = _to_cells([v_colors, v_alphas], grid)
-            behind = (image * upstream).sum(dim=1)
-            transmittance = torch.ones_like(behind)
+            behind = upstream.new_zeros(grid.count, upstream.shape[2])
             channels = values.shape[1]
-            sums = values.new_zeros(values.shape[0], padded(TERMS + 2 + channels + 1))
-            for lists in _lists(ellipses, ctx.strips, grid, settings.rows_per_list, transmittance):
-                for stretch in march(lists, behind.shape[1], settings.pairs_per_block):
+            sums = values.new_zeros(values.shape[0], padded(PULLS + channels))
+            for number, (run, start) in reversed(list(enumerate(ctx.starts))):
+                walked = (
+                    ctx.walked if number == len(ctx.starts) - 1 else _walk(table, ellipses, ctx.strips, run, grid, start, settings, scratch)
+                )
+                for stretch in reversed(walked):
                     arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
-                    for block in stretch.blocks(table, lists.splats, transmittance, scratch, settings.pairs_per_block):
-                        _backward_block(block, table.monomials, arriving, hidden, sums, settings.absgrad, scratch)
+                    for step, block in stretch.blocks_again(table, scratch):
+                        _backward_block(step, block, table.monomials, arriving, hidden, sums, settings.absgrad, scratch)
                     behind.index_copy_(0, stretch.cells, hidden)
-            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, : TERMS + 2].t().contiguous().unbind(0)
+            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, :PULLS].t().contiguous().unbind(0)
             A, B, C = ellipses.A, ellipses.B, ellipses.C
 
             def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
@@ -198,4 +233,4 @@ class _Composite(torch.autograd.Function):
             v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
             v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
             v_opacities = dense(opacities, [m / ellipses.opacity])
-        return v_means2d, v_conics, v_opacities, sums[:, TERMS + 2 : TERMS + 2 + channels], None, None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None, None, None
