@@ -1,4 +1,4 @@
-"""The ``fillerbuster`` command: rooms, train, convert, demo, sheet, export, bench, eval, check.
+"""The ``fillerbuster`` command: rooms, train, convert, complete, demo, sheet, export, bench, eval, check.
 
 Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it needs.
 """
@@ -121,6 +121,73 @@ def convert(
     logging.getLogger(__name__).info("wrote the model to %s", folder)
 
 
+def complete(
+    source: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    cameras: Literal["auto", "model", "features"] = "auto",
+    path: str = "ellipse",
+    views: int = 32,
+    photos: int = 16,
+    poses_only: bool = False,
+    known_poses: Path | None = None,
+    model: Path | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    steps: int | None = None,
+    sequence: int = 48,
+    prompt: str | None = None,
+    text_encoder: Path | None = None,
+    device: str | None = None,
+    fps: float = 8.0,
+    overwrite: bool = False,
+) -> None:
+    """Complete a scene from photos alone: find their cameras, generate views along a path, leave a capture for ns-train.
+
+    Args:
+        source: Folder of photos, film, or posed capture (whose cameras are then known).
+        output: New folder: capture, fly-through.mp4, sheet.png, cameras.png, raymaps, report.json.
+        cameras: What finds cameras: the model's raymaps, features, or the model and, where it is not sure, features.
+        path: ellipse (fitted to the cameras), orbit, spiral, or a camera path's JSON file in the world of the capture.
+        views: New views along the path.
+        photos: Photos that new views are conditioned on, chosen by coverage; all photos get cameras.
+        poses_only: Find cameras and generate nothing.
+        known_poses: Capture that knows the cameras of some of the photos, by their file names.
+        model: Model folder; by default the bundled one.
+        seed: Decides all that is drawn.
+        size: Side of new views in pixels; by default the model's.
+        steps: Denoising steps; by default the model's recommendation.
+        sequence: Most views, photos and new ones together, that the model sees at once; more are generated in further passes.
+        prompt: What is to be seen, for models that read text.
+        text_encoder: Folder with the CLIP text model, which prompts need.
+        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
+        fps: Pictures per second of the film.
+        overwrite: Replace an earlier output there.
+    """
+    from method_configs.complete_command import complete_scene
+    from method_configs.complete_options import CompleteOptions
+
+    options = CompleteOptions(
+        cameras=cameras,
+        path=path,
+        views=views,
+        photos=photos,
+        poses_only=poses_only,
+        known_poses=known_poses,
+        model=model,
+        seed=seed,
+        size=size,
+        steps=steps,
+        sequence=sequence,
+        prompt=prompt,
+        text_encoder=text_encoder,
+        device=device,
+        fps=fps,
+    )
+    complete_scene(source, output, options, overwrite=overwrite)
+
+
 def demo(
     *,
     output: Path = Path("outputs/demo"),
@@ -217,6 +284,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "rooms": rooms,
     "train": train,
     "convert": convert,
+    "complete": complete,
     "demo": demo,
     "sheet": sheet,
     "export": export,

@@ -19,6 +19,7 @@ FLOORS = (
     (
         *("fb_core.data", "fb_core.training", "fb_core.evaluation"),
         *("fb_core.registration", "fb_core.model_registration", "fb_core.feature_registration"),
+        *("fb_core.fly_through", "fb_core.duration"),
     ),
     ("fb_nerfstudio",),
     ("method_configs",),

@@ -1,0 +1,75 @@
+"""About how long a completion takes on a machine, before it starts: counted products over the rate that the machine reaches in one."""
+
+from __future__ import annotations
+
+import time
+from functools import lru_cache
+
+import torch
+
+from fb_core.inpainter import Fillerbuster
+from fb_core.memory import SIDE_MULTIPLE
+from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.networks.weights import without_weights
+from fb_core.sampling.options import SamplingConfig
+
+_OVERHEAD = 2.2  # a step takes so many times what its products alone would take (docs/speed_and_accuracy.md)
+_TRIAL_SECONDS = 0.05
+
+
+def expected_seconds(
+    model: Fillerbuster, *, views: int, known: int, side: int, sampling: SamplingConfig, recovers_rays: bool = False
+) -> float:
+    """Seconds that completing square views takes, right within a factor of two or so.
+
+    Args:
+        model: where it stands decides the machine.
+        views: of the sequence.
+        known: of them have a picture.
+        side: of the views in pixels.
+        sampling: steps, window and rounds.
+        recovers_rays: raymaps are decoded instead of pictures.
+    """
+    size = -(-side // SIDE_MULTIPLE) * SIDE_MULTIPLE
+    config = model.config.transformer
+    tokens = (size // (model.config.image_vae.factor * config.patch)) ** 2
+    window = min(sampling.window or views, views)
+    passes = sampling.steps * (sampling.rounds * -(-views // window) if window < views else 1)
+    branches = 1 if sampling.guidance_known == sampling.guidance_unknown == 1 else 2
+    per_token = 2 * (4 + 2 * config.mlp_ratio) * config.width**2 + 4 * config.width * tokens * window  # projections; attention
+    a_pass = config.depth * per_token * tokens * window
+    encoded = views * (_flops(model.config.image_vae, size)[0] + _flops(model.config.raymap_vae, size)[0])
+    decoded = (views if recovers_rays else views - known) * _flops(
+        model.config.raymap_vae if recovers_rays else model.config.image_vae, size
+    )[1]
+    rate = _rate(str(model.device), model.dit.dtype)
+    return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
+
+
+@lru_cache(maxsize=8)
+@torch.no_grad()
+def _flops(config: VAEConfig, size: int) -> tuple[int, int]:
+    """Of encoding and of decoding one view."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    vae = without_weights(lambda: VAE(config))
+    counts = []
+    latent = size // config.factor
+    for run, shape in ((vae.encode, (1, config.in_channels, size, size)), (vae.decode, (1, config.latent_channels, latent, latent))):
+        with FlopCounterMode(display=False) as counter:
+            run(torch.empty(shape, device="meta"))
+        counts.append(counter.get_total_flops())
+    return counts[0], counts[1]
+
+
+@lru_cache(maxsize=4)
+def _rate(device: str, dtype: torch.dtype) -> float:
+    """Floating-point operations per second of a large product, the best of a few."""
+    left, right = (torch.ones(512, 512, device=device, dtype=dtype) for _ in range(2))
+    best, began = float("inf"), time.perf_counter()
+    while best == float("inf") or time.perf_counter() - began < _TRIAL_SECONDS:
+        start = time.perf_counter()
+        product = left @ right
+        float(product[0, 0])  # waits for a GPU
+        best = min(best, time.perf_counter() - start)
+    return 2 * 512**3 / best

@@ -1,0 +1,257 @@
+"""``fillerbuster complete``: from photos, a film or a posed capture to cameras, new views along a path, and a capture to train on."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from fb_core.data.camera_path import read_camera_path
+from fb_core.data.captures import read_capture
+from fb_core.data.photo_choice import doubtful, require_two_views
+from fb_core.data.photos import Photo, read_photos
+from fb_core.data.whole_folder import whole_folder
+from fb_core.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
+from fb_core.geometry.camera_paths import PATHS, path_cameras
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.paths import strided_subset
+from fb_core.inpainter import Fillerbuster
+from method_configs.complete_options import CompleteOptions, Plan, pose_sampling
+from method_configs.complete_output import COMMAND, NewViews, World, is_ours, write_folder, write_report
+from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
+
+_WORKING = {
+    "file_path",
+    "mask_path",
+    "train_filenames",
+    "val_filenames",
+    "test_filenames",
+    "camera_model",
+    "distortion_params",
+    "fisheye_crop_radius",
+}
+_logger = logging.getLogger(__name__)
+
+
+class NoCameras(ValueError):
+    """Fewer than two photos have a camera that can be trusted; the report is there, a capture is not."""
+
+
+def complete_scene(source: Path, output: Path, options: CompleteOptions, *, overwrite: bool = False) -> dict[str, Any]:
+    """Run the command; returns what report.json holds.
+
+    Raises ValueError in one sentence: for input that cannot be used, for an output folder that is taken, for a full disk (then nothing is
+    written), and `NoCameras` when the cameras of fewer than two photos can be trusted (then the folder has report and sheet, no capture).
+    """
+    source, output = source.absolute(), output.absolute()
+    _check_output(output, source, overwrite)
+    clock = _Clock()
+    with clock.stage("reading"):
+        job = _read(source, options)
+    with clock.stage("loading the model"):
+        model = _load_model(options, needed=not options.poses_only or (options.cameras != "features" and not job.all_known))
+    found, new, told = _work(job, options, model, clock)
+    enough = len(found.trusted) >= FEWEST
+    report = report_of(source, options, job.photos, job.left_out, model, found, told)
+    try:
+        with whole_folder(output) as folder:
+            with clock.stage("writing"):
+                world = job.world if enough or not found.trusted else dataclasses.replace(job.world, points_path=None)
+                write_folder(folder, job.photos, job.left_out, found, new, world, fps=options.fps)
+            report |= {"seconds": clock.seconds, "peak_memory_gib": round(_peak_memory_gib(), 3)}
+            write_report(folder, report)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{output}: {error}; nothing was written") from error
+    if not enough:
+        raise NoCameras(no_cameras(job.photos, found, output))
+    _logger.info("wrote %s: %d photos with cameras, %d new views", output, len(found.trusted), 0 if new is None else len(new.images))
+    return report
+
+
+# ---- input --------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What was read."""
+
+    photos: list[Photo]
+    """Those that show something."""
+    left_out: dict[str, str]
+    """The others, with the reason."""
+    world: World
+    """Of the known cameras, or upright."""
+
+    @property
+    def all_known(self) -> bool:
+        return all(photo.camera is not None for photo in self.photos)
+
+
+def _check_output(output: Path, source: Path, overwrite: bool) -> None:
+    """An output never sweeps away the input, nor anything but an earlier output."""
+    if source == output or output in source.parents:
+        raise ValueError(f"--output {output} holds the input; choose another folder")
+    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
+        return
+    if not overwrite:
+        raise ValueError(f"--output {output} exists already; choose another folder, or replace it with --overwrite")
+    if not is_ours(output):
+        raise ValueError(f"--output {output} was not made by {COMMAND}, so that --overwrite does not touch it; choose another folder")
+
+
+def _read(source: Path, options: CompleteOptions) -> Job:
+    photos = read_photos(source)
+    world = _world_of(source if source.is_dir() else source.parent) if photos[0].camera is not None else None
+    if options.known_poses is not None:
+        photos, world = _with_known_poses(photos, options.known_poses), _world_of(options.known_poses)
+    unknown = [photo for photo in photos if photo.camera is None]
+    if len(unknown) == len(photos):
+        require_two_views(photos)
+    left_out = doubtful(photos) if unknown else {}
+    left_out = {photo.name: left_out[photo.name] for photo in unknown if photo.name in left_out}
+    for name, reason in left_out.items():
+        _logger.warning("left out: %s (%s)", name, reason)
+    upright = World(extra={"orientation_override": "none"})  # our worlds stand upright already; nerfstudio shall not turn them
+    return Job(photos=[photo for photo in photos if photo.name not in left_out], left_out=left_out, world=world or upright)
+
+
+def _world_of(folder: Path) -> World:
+    """What a posed capture says beside its cameras."""
+    capture = read_capture(folder)
+    return World(
+        extra={key: value for key, value in capture.extra.items() if key not in _WORKING},
+        points_path=capture.points_path if capture.points_path is not None and capture.points_path.is_file() else None,
+        straight=frozenset(frame.image_path for frame in capture.frames if not any(frame.distortion.values())),
+    )
+
+
+def _with_known_poses(photos: list[Photo], capture: Path) -> list[Photo]:
+    """The photos; those that the capture has by the same file name come from there, with camera and without lens distortion."""
+    posed = {photo.source.name: photo for photo in read_photos(capture)}
+    if not any(photo.source.name in posed for photo in photos):
+        raise ValueError(
+            f"--known-poses {capture}: none of its pictures has the file name of a photo, such as {photos[0].source.name}; rename them"
+        )
+    return [dataclasses.replace(posed[photo.source.name], name=photo.name) if photo.source.name in posed else photo for photo in photos]
+
+
+def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | None:
+    if not needed:
+        return None
+    device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    model = Fillerbuster.from_pretrained(options.model, device=device, text_encoder=options.text_encoder)
+    if options.prompt and not model.reads_text:
+        raise ValueError(f"--prompt: this model reads no text; leave the prompt out, got {options.prompt!r}")
+    return model
+
+
+# ---- work ---------------------------------------------------------------------------------------------------------------------
+
+
+def _work(
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock
+) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
+    """Cameras, then new views; what the report is to say of these."""
+    side = None if model is None else options.size or model.size
+    path = None if side is None else _path_of_file(options, side)
+    views = options.views if path is None else len(path)
+    plan = None if model is None or options.poses_only else Plan.of(len(job.photos), views, model, options)
+    sampling = None if model is None else pose_sampling(model, options)
+    _logger.info(announcement(job.photos, options, model, plan, sampling))
+    with _bars() as on_progress, clock.stage("cameras"):
+        found = find_cameras(job.photos, method=options.cameras, model=model, seed=options.seed, sampling=sampling, on_progress=on_progress)
+    for line in what_was_found(job.photos, found):
+        _logger.info(line)
+    if plan is None or model is None or len(found.trusted) < FEWEST:
+        return found, None, {}
+    context = choose_context(found, options.photos)
+    if path is None:
+        path = path_cameras(options.path, [found.camera(index) for index in found.trusted], views, size=plan.side)
+    if len(context) < plan.photos:
+        plan = Plan.of(len(context), views, model, options)
+    with _bars() as on_progress, clock.stage("new views"):
+        images = generate(
+            [job.photos[index] for index in context],
+            [found.camera(index) for index in context],
+            path.to(torch.float32),
+            plan.passes,
+            model,
+            seed=options.seed,
+            sampling=plan.sampling,
+            prompt=options.prompt,
+            on_progress=on_progress,
+        )
+    number = {view: number for number, chosen in enumerate(plan.passes.views) for view in chosen}
+    origins = [
+        {
+            "role": "fly-through",
+            "round": number[view],
+            "seed": options.seed + number[view],
+            "prompt": options.prompt or "",
+            "model_hash": model.model_hash,
+        }
+        for view in range(len(path))
+    ]
+    told = {"context": [job.photos[index].name for index in context], "passes": [len(chosen) for chosen in plan.passes.views]}
+    return found, NewViews(images=images, cameras=path, origins=origins), told
+
+
+def _path_of_file(options: CompleteOptions, side: int) -> Pinholes | None:
+    """The cameras of a camera path's file, thinned evenly to the number of views."""
+    if not options.path.lower().endswith(".json"):
+        if options.path not in PATHS:
+            raise ValueError(f"--path: expected {', '.join(PATHS)} or a camera path's .json file, got {options.path!r}")
+        return None
+    cameras = read_camera_path(Path(options.path), size=side).cameras
+    return cameras[strided_subset(len(cameras), options.views)]
+
+
+# ---- telling ------------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _bars() -> Iterator[Callable[[str, int, int], None]]:
+    """Progress on the terminal, one bar for each thing that is being done; nothing when it is not one."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    tasks: dict[str, TaskID] = {}
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+
+        def report(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(what.capitalize(), total=total)
+            progress.update(tasks[what], completed=done, total=total)
+
+        yield report
+
+
+class _Clock:
+    """Seconds of each stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = round(time.perf_counter() - began, 2)
+
+
+def _peak_memory_gib() -> float:
+    """Of this process, from its start; with a GPU, of the GPU."""
+    if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
+        return torch.cuda.max_memory_allocated() / 2**30
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

@@ -1,0 +1,94 @@
+"""What is asked of ``fillerbuster complete``, and the plan that follows from it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from fb_core.fly_through import Passes, plan_passes, room_beside
+from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.model_registration import ROUNDS
+
+POSES_AT_ONCE = 16
+"""Photos whose raymaps are denoised together; more are registered in windows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions:
+    """What is asked of the command."""
+
+    cameras: Literal["auto", "model", "features"] = "auto"
+    """What finds the cameras of photos that have none."""
+    known_poses: Path | None = None
+    """Capture that knows the cameras of some of the photos, by their file names."""
+    poses_only: bool = False
+    """End when the cameras are found."""
+    path: str = "ellipse"
+    """ellipse, orbit, spiral or a camera path's JSON file."""
+    views: int = 32
+    """New views along the path."""
+    photos: int = 16
+    """Photos that new views are conditioned on."""
+    sequence: int = 48
+    """Most views, photos and new ones together, that the model sees at once."""
+    size: int | None = None
+    """Side of new views in pixels; None is the model's."""
+    steps: int | None = None
+    """Denoising steps; None is the model's recommendation."""
+    seed: int = 0
+    """Decides all that is drawn."""
+    prompt: str | None = None
+    """For models that read text."""
+    model: Path | None = None
+    """Model folder; None is the bundled one."""
+    text_encoder: Path | None = None
+    """Folder of the CLIP text model, for prompts."""
+    device: str | None = None
+    """Where to compute; None is a GPU if there is one."""
+    fps: float = 8.0
+    """Pictures per second of the film."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("views", 1), ("photos", 1), ("sequence", 2), ("size", 16), ("steps", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name}: expected at least {least}, got {value}")
+        if not 0 < self.fps <= 240:
+            raise ValueError(f"fps: expected between 0 and 240 pictures per second, got {self.fps:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How new views will be generated."""
+
+    photos: int
+    """Photos that they are conditioned on."""
+    side: int
+    """Of the views in pixels."""
+    sampling: SamplingConfig
+    """Of each pass."""
+    passes: Passes
+    """Which views are generated together."""
+
+    @property
+    def longest(self) -> int:
+        """Views of the longest sequence."""
+        later = [len(chosen) + self.passes.anchors for chosen in self.passes.views[1:]]
+        return self.photos + max([len(self.passes.views[0]), *later])
+
+    @staticmethod
+    def of(photos: int, views: int, model: Fillerbuster, options: CompleteOptions) -> Plan:
+        """For so many photos with a camera and views along the path. Raises ValueError when memory does not suffice for one view."""
+        photos, side = min(photos, options.photos), options.size or model.size
+        sampling = model.recommended_sampling
+        sampling = sampling if options.steps is None else dataclasses.replace(sampling, steps=options.steps)
+        room = room_beside(photos, model, sequence=options.sequence, views=views, side=side, sampling=sampling, prompt=options.prompt)
+        return Plan(photos=photos, side=side, sampling=sampling, passes=plan_passes(views, room=room))
+
+
+def pose_sampling(model: Fillerbuster, options: CompleteOptions) -> SamplingConfig:
+    """The paper's budget for raymaps, with no more steps than were asked for."""
+    sampling = dataclasses.replace(model.recommended_sampling.for_poses(), rounds=ROUNDS)
+    return sampling if options.steps is None else dataclasses.replace(sampling, steps=min(options.steps, sampling.steps))

@@ -1,0 +1,138 @@
+"""What ``fillerbuster complete`` says before, while and after it works: sentences for people, and the content of report.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from fb_core.data.photos import Photo
+from fb_core.duration import expected_seconds
+from fb_core.fly_through import FoundCameras
+from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.memory import GIB
+from method_configs.complete_options import POSES_AT_ONCE, CompleteOptions, Plan
+from method_configs.complete_output import COMMAND
+
+_METHODS = {"known": "given", "model": "by the model", "features": "by features"}
+
+
+def announcement(
+    photos: list[Photo], options: CompleteOptions, model: Fillerbuster | None, plan: Plan | None, pose_sampling: SamplingConfig | None
+) -> str:
+    """One sentence on what is about to be done, how long it may take and how much memory it needs."""
+    unknown = sum(photo.camera is None for photo in photos)
+    posed = "" if unknown == len(photos) else f" ({len(photos) - unknown} with known cameras)"
+    if model is None or (plan is None and unknown == 0):
+        how = "known" if unknown == 0 else "features"
+        return f"Finding the cameras of {len(photos)} photos{posed} by {how}."
+    seconds, memory = 0.0, 0
+    if unknown and options.cameras != "features":
+        assert pose_sampling is not None
+        together = min(len(photos), POSES_AT_ONCE)
+        seconds += (
+            len(photos)
+            / together
+            * expected_seconds(model, views=together, known=together, side=model.size, sampling=pose_sampling, recovers_rays=True)
+        )
+        memory = model.estimate(together, (model.size, model.size), pose_sampling).peak
+    name = "the bundled model" if options.model is None else f"model {options.model.name}"
+    named = f"{name} ({model.model_hash[:8]})"
+    if plan is None:
+        return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {_cost(seconds, memory)}."
+    for number, chosen in enumerate(plan.passes.views):
+        views = plan.photos + len(chosen) + (plan.passes.anchors if number else 0)
+        seconds += expected_seconds(model, views=views, known=views - len(chosen), side=plan.side, sampling=plan.sampling)
+    memory = max(memory, model.estimate(plan.longest, (plan.side, plan.side), plan.sampling, prompt=options.prompt).peak)
+    count = len(plan.passes.views)
+    passes = f"{count} {'pass' if count == 1 else 'passes'} of {plan.sampling.steps} steps over up to {plan.longest} views"
+    along = f"along {Path(options.path).name}" if options.path.endswith(".json") else f"along the {options.path}"
+    return (
+        f"Completing the scene with {named}: {sum(map(len, plan.passes.views))} new views {along} of {plan.side}x{plan.side} pixels in "
+        f"{passes}, conditioned on {plan.photos} of {len(photos)} photos{posed}; {_cost(seconds, memory)}."
+    )
+
+
+def _cost(seconds: float, memory: int) -> str:
+    """In round numbers, which is all that is known."""
+    rounded = float(f"{seconds:.1g}")
+    if rounded >= 100:
+        minutes = max(2, round(seconds / 60))
+        return f"expected to take the model about {minutes} minutes and {memory / GIB:.1f} GiB"
+    return f"expected to take the model about {max(1, round(rounded))} s and {memory / GIB:.1f} GiB"
+
+
+def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
+    """How many photos have a camera, and which are left out."""
+    trusted, registration = found.trusted, found.registration
+    lines = [f"{len(trusted)} of {len(photos)} photos have a camera ({_METHODS[found.method]})."]
+    if len(found.tried) > 1:
+        lines[0] = (
+            f"The model is sure of {found.tried['model']} of {len(photos)} cameras, features of {found.tried['features']}. " + lines[0]
+        )
+    for index in range(len(photos)):
+        if index not in trusted:
+            reason = registration.reasons[index] or "there is no camera that fits"
+            lines.append(f"left out: {photos[index].name} ({registration.verdicts[index]}: {reason})")
+    return lines
+
+
+def no_cameras(photos: list[Photo], found: FoundCameras, output: Path) -> str:
+    """Why there is no capture, and what can be done."""
+    verdicts = Counter(found.registration.verdicts)
+    told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    other = "features" if "features" not in found.tried else "model" if "model" not in found.tried else None
+    advice = f"try --cameras {other}" if other else "add photos that overlap more, or give poses that you have with --known-poses"
+    return (
+        f"cameras of {len(photos)} photos: expected at least two that can be trusted, got {len(found.trusted)} ({told}); {advice}. "
+        f"None was made up; {output} has the report"
+    )
+
+
+def report_of(
+    source: Path,
+    options: CompleteOptions,
+    photos: list[Photo],
+    left_out: dict[str, str],
+    model: Fillerbuster | None,
+    found: FoundCameras,
+    told: dict[str, Any],
+) -> dict[str, Any]:
+    """The content of report.json that is known before the folder is written."""
+    registration, trusted = found.registration, set(found.trusted)
+    entries = []
+    for index, photo in enumerate(photos):
+        residual, camera = registration.residuals_degrees[index], registration.cameras[index]
+        entries.append(
+            {
+                "name": photo.name,
+                "source": photo.source.name,
+                "seconds": photo.seconds,
+                "width": photo.size[1],
+                "height": photo.size[0],
+                "used": index in trusted,
+                "verdict": registration.verdicts[index],
+                "reason": registration.reasons[index],
+                "residual_degrees": None if math.isnan(residual) else residual,
+                "focal": None if camera is None or index not in trusted else camera.focal[0].tolist(),
+            }
+        )
+    entries += [{"name": name, "used": False, "verdict": "left out", "reason": reason} for name, reason in left_out.items()]
+    return {
+        "command": COMMAND,
+        "input": source,
+        "options": dataclasses.asdict(options),
+        "seed": options.seed,
+        "model": None if model is None else {"hash": model.model_hash, "size": model.size, "preset": model.info.get("preset")},
+        "cameras": {
+            "method": found.method,
+            "trusted_by_method": found.tried,
+            "trusted": len(trusted),
+            "photos": len(photos) + len(left_out),
+            "arrangement": str(registration.arrangement),
+        },
+        "photos": entries,
+        **told,
+    }
