@@ -76,10 +76,13 @@ class Block:
     values: Float[Tensor, "b s d1"]
     """Channels, and a last one of ones, which composites to alpha."""
     alpha: Float[Tensor, "b s p"]
+    """Before the stop."""
     weights: Float[Tensor, "b s p"]
-    """alpha times the transmittance in front."""
-    behind: Float[Tensor, "s p"]
-    """Transmittance behind the block, as if nothing had stopped."""
+    """alpha times the transmittance in front; 0 from where a pixel stops."""
+    lights: Float[Tensor, "b s p"]
+    """Transmittance behind each rank, as if nothing had stopped."""
+    stops: bool
+    """Whether some pixel stops in this block."""
     capped: Bool[Tensor, "b s p"] | None
     """Pairs at the cap, or None where there are none."""
 
@@ -98,7 +101,7 @@ class Scratch:
         if view is None:
             size = math.prod(shape)
             if name not in self._buffers or self._buffers[name].numel() < size:
-                self._buffers[name] = self._like.new_zeros(size)
+                self._buffers[name] = self._like.new_empty(size)
                 self._views = {key: value for key, value in self._views.items() if key[0] != name}
                 self._layers = {key: value for key, value in self._layers.items() if key[0] != name}
             view = self._views[(name, *shape)] = self._buffers[name][:size].view(shape)
@@ -169,10 +172,10 @@ class Stretch:
             step = Step(depth=depth, splats=splats, padding=padding, light=light[:width].clone())
             self.steps.append(step)
             block = _evaluate(table, step, centers, scratch)
-            light[:width] = block.behind
+            light[:width] = block.lights[-1]
             rank += depth
             yield block
-            if rank < deepest and float(block.behind.min()) <= TRANSMITTANCE_MIN:
+            if rank < deepest and block.stops:
                 still = (light[:width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
                 if int(still.sum()) <= 0.75 * width:
                     kept = still.nonzero()[:, 0]
@@ -182,11 +185,11 @@ class Stretch:
                     break
         transmittance.index_copy_(0, self.cells, light)
 
-    def blocks_again(self, table: Table, scratch: Scratch) -> Iterator[tuple[Step, Block]]:
+    def blocks_again(self, table: Table, scratch: Scratch) -> Iterator[Block]:
         """The blocks that have been walked, last one first."""
         centers = self._centers(table)
         for step in reversed(self.steps):
-            yield step, _evaluate(table, step, centers, scratch)
+            yield _evaluate(table, step, centers, scratch)
 
     def _centers(self, table: Table) -> Float[Tensor, "2 1 s"]:
         return table.centers.index_select(1, self.cells)[:, None]
@@ -227,11 +230,11 @@ def _evaluate(table: Table, step: Step, centers: Float[Tensor, "2 1 s"], scratch
     weights, lights = scratch.take("weights", depth, width, pixels), scratch.take("light", depth + 1, width, pixels)
     lights[0] = step.light
     _darken(alpha, weights, lights, scratch)
-    if float(lights[-1].min()) <= TRANSMITTANCE_MIN:
-        _stop(alpha, lights[1:])
-        _stop(weights, lights[1:])
+    stops = float(lights[-1].min()) <= TRANSMITTANCE_MIN
+    if stops:
+        stop(weights, lights[1:])
     values = rows[:, GEOMETRY : GEOMETRY + table.channels].view(depth, width, -1)
-    return Block(columns=k, values=values, alpha=alpha, weights=weights, behind=lights[depth], capped=capped)
+    return Block(columns=k, values=values, alpha=alpha, weights=weights, lights=lights[1:], stops=stops, capped=capped)
 
 
 def _darken(alpha: Tensor, weights: Tensor, lights: Tensor, scratch: Scratch) -> None:
@@ -248,7 +251,7 @@ def _darken(alpha: Tensor, weights: Tensor, lights: Tensor, scratch: Scratch) ->
         before = after
 
 
-def _stop(values: Tensor, after: Tensor) -> None:
+def stop(values: Tensor, after: Tensor) -> None:
     """Take out the Gaussian that would end a pixel, and all behind it: 0 where after <= 1e-4, in one pass."""
     torch.ops.aten.threshold_backward.grad_input(values, after, TRANSMITTANCE_MIN, grad_input=values)
 

@@ -25,11 +25,11 @@ from fb_nerfstudio.torch_blocks import (
     TRANSMITTANCE_MIN,
     Block,
     Scratch,
-    Step,
     Stretch,
     Table,
     march,
     padded,
+    stop,
     table_of,
 )
 from fb_nerfstudio.torch_cells import CellGrid, CellLists, Ellipses, Strips, list_cells, measure_strips, slabs
@@ -77,28 +77,28 @@ def _forward_block(block: Block, image: Tensor) -> None:
 
 
 def _backward_block(
-    step: Step, block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, sums: Tensor, absgrad: bool, scratch: Scratch
+    block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, out: Float[Tensor, "bs r"], absgrad: bool, scratch: Scratch
 ) -> None:
-    """Add the block's gradients to `sums` [v, r]; `behind` [s, p] is brought from what is seen behind the block to what is seen of it.
+    """Gradients of the block's rows; `behind` [s, p] is brought from what is seen behind the block to what is seen of it.
 
-    The columns of `sums`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
+    The columns of `out`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
     """
     depth, width, pixels = block.alpha.shape
     upstream, behind = upstream[:width], behind[:width]
-    new = scratch.take("new", depth * width, sums.shape[1])
-    v_values = new[:, PULLS : PULLS + upstream.shape[1] - 1].view(depth, width, -1)
+    if block.stops:
+        stop(block.alpha, block.lights)
+    v_values = out[:, PULLS : PULLS + upstream.shape[1] - 1].view(depth, width, -1)
     v_values.copy_(torch.bmm(upstream[:, :-1], block.weights.permute(1, 2, 0)).permute(2, 0, 1))
     torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
     g = _slopes(depth, behind, scratch)
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
     g = g.view(depth * width, pixels)
-    columns = scratch.take("moments", PULLS, depth * width)
-    _central_moments(block.columns[6:8], torch.mm(monomials, g.t()), columns[:TERMS])
+    columns, local = scratch.take("moments", PULLS, depth * width), scratch.take("local", TERMS, depth * width)
+    _central_moments(block.columns[6:8], torch.mm(monomials, g.t(), out=local), columns[:TERMS])
     if absgrad:
         _absolute_pulls(block.columns, monomials, g, columns[TERMS:], scratch)
-    new[:, :PULLS] = columns.t()
-    sums.index_add_(0, step.splats.long(), new)  # several times faster with 64-bit indices
+    out[:, :PULLS] = columns.t()
 
 
 def _slopes(depth: int, behind: Float[Tensor, "s p"], scratch: Scratch) -> Float[Tensor, "b s p"]:
@@ -133,6 +133,13 @@ def _absolute_pulls(columns: Tensor, monomials: Tensor, g: Tensor, out: Float[Te
         line = torch.stack([columns[constant], -columns[along_u], -columns[along_v]])
         pull = torch.mm(line.t(), monomials[:3], out=scratch.take("weights", *g.shape))
         torch.sum(pull.abs_().mul_(size), dim=1, out=total).mul_(math.log(2.0))
+
+
+def _add_rows(sums: Float[Tensor, "v r"], splats: Int32[Tensor, " m"], rows: Float[Tensor, "m r"]) -> None:
+    """sums[splats[i]] += rows[i]. Sorting and summing whole bags takes half as long as `index_add_`."""
+    order = torch.sort(splats).indices
+    counts = torch.bincount(splats, minlength=sums.shape[0])
+    sums.add_(F.embedding_bag(order, rows, counts.cumsum(0) - counts, mode="sum"))
 
 
 def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, transmittance: Tensor | None) -> CellLists:
@@ -198,7 +205,8 @@ class _Composite(torch.autograd.Function):
                     walked.append(stretch)
             colors, alphas = _to_image(image[:, :-1], grid), _to_image(image[:, -1:], grid)
         ctx.save_for_backward(means2d, conics, opacities, values, chosen)
-        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings, ctx.walked, ctx.starts = ellipses, strips, grid, settings, walked, starts
+        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
+        ctx.table, ctx.scratch, ctx.walked, ctx.starts = table, scratch, walked, starts
         return colors, alphas
 
     @staticmethod
@@ -207,20 +215,25 @@ class _Composite(torch.autograd.Function):
         means2d, conics, opacities, values, chosen = ctx.saved_tensors
         ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
         with single_thread():
-            table, scratch = table_of(ellipses, values, grid, settings.alpha_cap), Scratch(values)
+            table, scratch = ctx.table, ctx.scratch
             upstream = _to_cells([v_colors, v_alphas], grid)
             behind = upstream.new_zeros(grid.count, upstream.shape[2])
             channels = values.shape[1]
             sums = values.new_zeros(values.shape[0], padded(PULLS + channels))
             for number, (run, start) in reversed(list(enumerate(ctx.starts))):
-                walked = (
-                    ctx.walked if number == len(ctx.starts) - 1 else _walk(table, ellipses, ctx.strips, run, grid, start, settings, scratch)
-                )
+                last = number == len(ctx.starts) - 1
+                walked = ctx.walked if last else _walk(table, ellipses, ctx.strips, run, grid, start, settings, scratch)
+                splats = torch.cat([step.splats for stretch in walked for step in stretch.steps])
+                rows = values.new_empty(splats.shape[0], sums.shape[1])
+                end = rows.shape[0]
                 for stretch in reversed(walked):
                     arriving, hidden = upstream.index_select(0, stretch.cells), behind.index_select(0, stretch.cells)
-                    for step, block in stretch.blocks_again(table, scratch):
-                        _backward_block(step, block, table.monomials, arriving, hidden, sums, settings.absgrad, scratch)
+                    for block in stretch.blocks_again(table, scratch):
+                        begin = end - block.columns.shape[1]
+                        _backward_block(block, table.monomials, arriving, hidden, rows[begin:end], settings.absgrad, scratch)
+                        end = begin
                     behind.index_copy_(0, stretch.cells, hidden)
+                _add_rows(sums, splats, rows)
             m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, :PULLS].t().contiguous().unbind(0)
             A, B, C = ellipses.A, ellipses.B, ellipses.C
 
