@@ -16,13 +16,17 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from method_configs.demo import FAMILY, run_folder, training_arguments
 from method_configs.training_process import TrainingProcess
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fb_core.data.captures import Capture
     from fb_core.evaluation.benchmarks import Bar, Report
+    from fb_core.geometry.cameras import Pinholes
 
 NEW_VIEWS = ("fillerbuster-none", "fillerbuster", "fillerbuster-paper", "fillerbuster-cat3d-size")
 MASKED = ("fillerbuster-none", "fillerbuster-masked", "nerfiller-grid")
@@ -50,6 +54,8 @@ class Methods:
     """Held-out pictures, half of them covered by the capture."""
     block: float = 0.35
     """Side of the block that is cut out, as a part of the picture's."""
+    block_in: Literal["picture", "world"] = "picture"
+    """Cut the middle out of every picture, or, as people's masks do, one cube of the room out of the pictures that show it."""
     model: Path | None = None
     """Model folder; by default the bundled one."""
     output: Path = Path("outputs/methods")
@@ -78,7 +84,8 @@ def run_methods(config: Methods) -> Report:
         raise ValueError(f"block: expected a part of the picture's side between 0 and 1, got {config.block}")
     rows: list[dict[str, Any]] = []
     for room in config.rooms:
-        plain, cut = config.output / f"room-{room}", config.output / f"room-{room}-masked"
+        masked = "masked" if config.block_in == "picture" else "masked-in-world"
+        plain, cut = config.output / f"room-{room}", config.output / f"room-{room}-{masked}"
         make_captures(plain / "capture", cut / "capture", room, config)
         rows += [_measured("new views", method, room, plain, config) for method in config.new_views]
         rows += [_measured("masked", method, room, cut, config) for method in config.masked]
@@ -92,34 +99,70 @@ def make_captures(plain: Path, cut: Path, room: int, config: Methods) -> None:
     if not plain.exists():
         rooms(room, plain, family=FAMILY, views=config.views, size=config.size, held_out=config.held_out)
     if not cut.exists():
-        cut_blocks(plain, cut, share=config.block)
+        cut_blocks(plain, cut, share=config.block, block_in=config.block_in)
 
 
-def cut_blocks(plain: Path, cut: Path, *, share: float) -> None:
-    """Copy a capture; captured pictures lose a centred square block (black in picture and mask), held-out ones keep all.
+def cut_blocks(plain: Path, cut: Path, *, share: float, block_in: Literal["picture", "world"] = "picture") -> None:
+    """Copy a capture; captured pictures lose a block (black in picture and mask), held-out ones keep all.
 
     Args:
-        plain: the capture, with ``train_filenames``.
+        plain: the capture, with ``train_filenames`` and points.
         cut: the new folder.
         share: the block's side as a part of the picture's.
+        block_in: a centred square in every picture, or a cube in the world that is about as large in the pictures that show it.
     """
     import torch
 
     from fb_core.data import media
+    from fb_core.data.captures import read_capture
 
+    capture = read_capture(plain)
     shutil.copytree(plain, cut)
     content = json.loads((cut / "transforms.json").read_text(encoding="utf-8"))
+    captured = [name in content["train_filenames"] for name in (frame["file_path"] for frame in content["frames"])]
+    cameras = [frame.camera for frame in capture.frames]
+    cube = _cube(capture, [camera for camera, one in zip(cameras, captured, strict=True) if one], share) if block_in == "world" else None
     (cut / "masks").mkdir(exist_ok=True)
-    for frame in content["frames"]:
+    for frame, camera, one in zip(content["frames"], cameras, captured, strict=True):
         image = media.read_image(cut / frame["file_path"])
         known = torch.ones_like(image[:1])
-        if frame["file_path"] in content["train_filenames"]:
-            rows, columns = (_middle(side, share) for side in image.shape[1:])
-            known[:, rows, columns] = 0
+        if one:
+            if cube is None:
+                rows, columns = (_middle(side, share) for side in image.shape[1:])
+                known[:, rows, columns] = 0
+            else:
+                known[:, shows_cube(camera, *cube)] = 0
             media.write_image(cut / frame["file_path"], image * known)
         frame["mask_path"] = f"masks/{Path(frame['file_path']).stem}.png"
         media.write_image(cut / frame["mask_path"], known)
     (cut / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def shows_cube(camera: Pinholes, center: Tensor, side: float) -> Tensor:
+    """Which pixels [h, w] of one camera look at an axis-aligned cube, by its three pairs of planes (Kay and Kajiya 1986)."""
+    directions, start = camera.directions()[0], center.to(camera.centers) - camera.centers[0]
+    near, far = ((start + sign * side / 2) / directions for sign in (-1, 1))
+    enters, leaves = near.minimum(far).amax(dim=-1), near.maximum(far).amin(dim=-1)
+    return (leaves > enters) & (leaves > 0)
+
+
+def _cube(capture: Capture, cameras: Sequence[Pinholes], share: float) -> tuple[Tensor, float]:
+    """Centre and side of a cube around the surface point that most captured pictures show."""
+    import torch
+
+    from fb_core.data.points import read_points
+
+    assert capture.points_path is not None  # rooms have points
+    points = read_points(capture.points_path).positions
+    shown = torch.zeros(len(points))
+    for camera in cameras:
+        pixels, depth = camera.project(points.to(camera.centers))
+        inside = (pixels[0] > 0) & (pixels[0] < pixels.new_tensor([camera.width, camera.height]))
+        shown += inside.all(dim=-1) & (depth[0] > 0)
+    center = points[int(shown.argmax())]
+    distances = torch.stack([(center.to(camera.centers) - camera.centers[0]).norm() for camera in cameras])
+    width = torch.stack([camera.width / camera.focal[0, 0] for camera in cameras])
+    return center, share * float((distances * width).median())
 
 
 def arguments_of(method: str, folder: Path, room: int, config: Methods) -> list[str]:
@@ -149,7 +192,7 @@ def _measured(part: str, method: str, room: int, folder: Path, config: Methods) 
     row: dict[str, Any] = {"part": part, "method": method, "room": room} | trained(method, folder, room, config)
     row |= quality_of(run, folder / "capture")
     if part == "masked":
-        row |= consistency_of(run, folder.with_name(f"room-{room}") / "capture", share=config.block)
+        row |= consistency_of(run, folder.with_name(f"room-{room}") / "capture")
     (run / _ROW).write_text(json.dumps(row, indent=1, allow_nan=False), encoding="utf-8")
     return row
 
@@ -197,7 +240,7 @@ def quality_of(run: Path, capture: Path) -> dict[str, float]:
     return row
 
 
-def consistency_of(run: Path, plain: Path, *, share: float) -> dict[str, float | None]:
+def consistency_of(run: Path, plain: Path) -> dict[str, float | None]:
     """How far the final renders agree with the inpainted pictures, and inside the block with what was cut out.
 
     ``consistency_psnr`` and ``consistency_ssim`` are the paper's table 1: inpainted pictures against renders from the same viewpoints;
@@ -226,10 +269,10 @@ def consistency_of(run: Path, plain: Path, *, share: float) -> dict[str, float |
         truth = {frame.image_path.name: frame.load_image() for frame in read_capture(plain).frames}
         blocks = []
         for index, name in enumerate(manager.train_dataset.image_filenames):
-            picture = truth[Path(name).name]
-            rows, columns = (_middle(side, share) for side in picture.shape[1:])
-            render_here = render(manager.train_dataset.cameras[index : index + 1])
-            blocks.append(psnr(render_here[None, :, rows, columns], picture[None, :, rows, columns]))
+            block = ~manager.cached_train[index]["mask"][..., 0].cpu()
+            if bool(block.any()):
+                rendered = render(manager.train_dataset.cameras[index : index + 1])
+                blocks.append(psnr(rendered[None, :, block, None], truth[Path(name).name][None, :, block, None]))
         row["block_psnr"] = round(float(torch.cat(blocks).mean()), 3)
     return row
 

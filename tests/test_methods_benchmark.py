@@ -12,7 +12,17 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from fb_core.data.captures import read_capture, validate_capture
 from method_configs import methods_benchmark, splats
-from method_configs.methods_benchmark import MASKED, NEW_VIEWS, Methods, arguments_of, bars_of, cut_blocks, means_of, run_methods
+from method_configs.methods_benchmark import (
+    MASKED,
+    NEW_VIEWS,
+    Methods,
+    arguments_of,
+    bars_of,
+    cut_blocks,
+    means_of,
+    run_methods,
+    shows_cube,
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +45,34 @@ def test_a_block_is_cut_out_of_captured_pictures_only(plain: Path, tmp_path: Pat
             assert bool((mask[:, 8:24, 8:24] == 0).all()) and float(after.load_image()[:, 8:24, 8:24].max()) == 0.0
         assert torch.allclose(after.load_image() * mask, before.load_image() * mask, atol=1e-6)
     assert read_capture(tmp_path / "cut").points_path is not None
+
+
+def test_one_cube_of_the_room_is_cut_out_of_the_pictures_that_show_it(tmp_path: Path):
+    from fb_core.data.room_captures import rooms
+
+    plain = tmp_path / "plain"
+    rooms(0, plain, views=6, size=64, held_out=2)
+    cut_blocks(plain, tmp_path / "cut", share=0.3, block_in="world")
+    whole, cut = validate_capture(plain), validate_capture(tmp_path / "cut", decode=True)
+    cut_out = [frame.load_mask()[0] == 0 for frame in cut.frames]
+    captured = [frame.image_path.name.startswith("captured") for frame in whole.frames]
+    assert any(bool(mask.any()) for mask, one in zip(cut_out, captured, strict=True) if one)
+    assert not any(bool(mask.any()) for mask, one in zip(cut_out, captured, strict=True) if not one)
+    assert not any(bool(mask.all()) for mask in cut_out)
+
+
+def test_pixels_that_look_at_a_cube():
+    from fb_core.geometry.cameras import Pinholes
+
+    origin, ahead, up = torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0, 1.0])
+    camera = Pinholes.looking_at(origin, ahead, up=up, fov_degrees=90.0, width=100, height=100)
+    mask = shows_cube(camera, torch.tensor([2.0, 0.0, 0.0]), 1.0)
+    rows, columns = mask.nonzero().T
+    half = 50 * 0.5 / 1.5  # the near face is 1.5 away and 1 wide; a pixel's centre decides
+    assert (int(rows.min()), int(rows.max())) == (int(columns.min()), int(columns.max())) == (round(50 - half), round(49 + half))
+    assert bool(mask[34:66, 34:66].all()), "and it is filled"
+    assert not bool(shows_cube(camera, torch.tensor([-2.0, 0.0, 0.0]), 1.0).any()), "behind the camera"
+    assert bool(shows_cube(camera, torch.zeros(3), 1.0).all()), "the camera stands inside"
 
 
 @pytest.mark.parametrize("method", dict.fromkeys([*NEW_VIEWS, *MASKED]))
@@ -84,7 +122,7 @@ def test_every_method_runs_on_every_room_and_a_second_benchmark_only_reads(tmp_p
     monkeypatch.setattr(methods_benchmark, "trained", train)
     quality = {"uncovered_psnr": 12.0, "uncovered_hole_share": 0.1}
     monkeypatch.setattr(methods_benchmark, "quality_of", lambda run, capture: dict(quality))
-    monkeypatch.setattr(methods_benchmark, "consistency_of", lambda run, plain, share: {"consistency_psnr": 20.0})
+    monkeypatch.setattr(methods_benchmark, "consistency_of", lambda run, plain: {"consistency_psnr": 20.0})
     config = Methods(rooms=(0, 1), views=2, size=32, held_out=2, output=tmp_path / "out")
     report = run_methods(config)
     assert [(method, room) for name, method, room in asked if "masked" in name] == [(method, room) for room in (0, 1) for method in MASKED]
