@@ -7,37 +7,20 @@ import json
 
 import pytest
 import torch
+from tiny_training import SMALL_VAE, TOY, TOY_LOOP
 
 from fb_core.data.sequences import PoolConfig, RoomPool, TaskConfig, draw_task
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.dit import DiT
 from fb_core.networks.vae import VAE, VAEConfig
-from fb_core.training.dit_stage import DiTLossConfig, encode_sequences
+from fb_core.training.dit_stage import encode_sequences
 from fb_core.training.linear_start import start_linear
 from fb_core.training.loop import LoopConfig, Run, Stage, row_generator
-from fb_core.training.recipe import STAGES, Recipe, export, run_stage
-from fb_core.training.vae_stage import VAELossConfig, kl_divergence, reconstruction_error
+from fb_core.training.recipe import STAGES, export, run_stage
+from fb_core.training.vae_stage import kl_divergence, reconstruction_error
 from fb_core.views import Views
 from method_configs.ablations import PRESETS, ROOMS_TINY
-
-_SMALL_VAE = {"widths": (8, 8, 8, 8), "encoder_resnets": 1, "decoder_resnets": 1, "norm": "none"}
-_LOOP = LoopConfig(steps=4, learning_rate=1e-3, warmup_steps=1, save_every=2)
-TOY = Recipe(
-    name="toy",
-    image_vae=VAEConfig(**_SMALL_VAE),
-    raymap_vae=VAEConfig(in_channels=6, padding="replicate", **_SMALL_VAE),
-    dit=DiTConfig(heads=2, head_dim=16, depth=1, text_width=0),
-    pool=PoolConfig(rooms=3, views=5, image_size=16, renewed_per_step=0.5, supersample=1),
-    vae_pool=PoolConfig(rooms=2, views=4, image_size=16, renewed_per_step=0.5, supersample=1),
-    image_vae_loop=_LOOP,
-    raymap_vae_loop=_LOOP,
-    dit_loop=_LOOP,
-    image_vae_loss=VAELossConfig(batch=2),
-    raymap_vae_loss=VAELossConfig(batch=2),
-    dit_loss=DiTLossConfig(batch=2, task=TaskConfig(views=4)),
-    sampling=SamplingConfig(guidance_unknown=2.0, steps=3),
-)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -114,7 +97,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(tmp_path)
             return {"loss": (self.network.weight.sum() * drawn).square().mean()}
 
     stage = Broken()
-    run = Run(stage, dataclasses.replace(_LOOP, steps=9), tmp_path)
+    run = Run(stage, dataclasses.replace(TOY_LOOP, steps=9), tmp_path)
     with pytest.raises(FloatingPointError, match=r"at step 3 \(rows 2 of the batch\); the last good state is .*checkpoint.pt"):
         run.train()
     assert all(torch.isfinite(p).all() for p in stage.network.parameters())
@@ -124,7 +107,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(tmp_path)
 def test_a_checkpoint_of_another_stage_is_refused(finished):
     folder, runs = finished
     with pytest.raises(ValueError, match="holds stage 'dit', expected 'image-vae'"):
-        Run(runs["image-vae"].stage, _LOOP, folder / "dit")
+        Run(runs["image-vae"].stage, TOY_LOOP, folder / "dit")
 
 
 def test_the_transformer_needs_its_autoencoders(tmp_path):
@@ -218,7 +201,7 @@ def test_linear_start_nearly_reproduces_raymaps():
 
 def test_linear_start_refuses_norms():
     with pytest.raises(ValueError, match="expected no norms"):
-        start_linear(VAE(VAEConfig(**_SMALL_VAE | {"norm": "group", "norm_groups": 4})), seeded())
+        start_linear(VAE(VAEConfig(**SMALL_VAE | {"norm": "group", "norm_groups": 4})), seeded())
 
 
 def test_preset_of_the_bundled_model_is_listed_and_fits_the_network():

@@ -1,0 +1,239 @@
+"""Laws of the loop on one process: parts of a batch, kills at any step, checkpoints, full disks, and what may not change anything."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_training import LOOP, TOY, TinyStage, losses_of, run_in
+
+from fb_core.training.distributed import ALONE
+from fb_core.training.loop import EngineConfig, LoopConfig, Run, Stage
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = dataclasses.replace(LOOP, steps=6, save_every=2)
+
+
+def weights(run: Run) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in run.stage.network.state_dict().items()}
+
+
+def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    run = Run(TinyStage(), SHORT, tmp_path_factory.mktemp("whole"))
+    run.train()
+    return run
+
+
+@pytest.mark.parametrize("killed_after", [1, 2, 3, 4, 5])
+def test_killed_at_any_step_it_repeats_bit_for_bit(whole, tmp_path, killed_after):
+    def kill(done, of, losses):
+        if done == killed_after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Run(TinyStage(), SHORT, tmp_path).train(on_progress=kill)
+    resumed = Run(TinyStage(), SHORT, tmp_path)
+    assert resumed.step == (killed_after - 1) // 2 * 2  # the last even step whose checkpoint was written
+    resumed.train()
+    assert losses_of(tmp_path) == losses_of(whole.folder)
+    assert same(weights(resumed), weights(whole)) and same(resumed.averaged_state(), whole.averaged_state())
+
+
+@pytest.mark.parametrize("changed", [{"accumulate": 2}, {"accumulate": 4}, {"recompute": True}])
+def test_parts_and_recomputed_activations_change_rounding_only(whole, tmp_path, changed):
+    run = run_with(tmp_path, **changed)
+    assert losses_of(tmp_path) == pytest.approx(losses_of(whole.folder), abs=2e-6)
+    for name, value in weights(whole).items():
+        assert torch.allclose(weights(run)[name], value, atol=1e-5), name
+
+
+def test_recomputed_blocks_run_twice():
+    calls = []
+    for recompute in (False, True):
+        run = Run(TinyStage(), SHORT, None, engine=EngineConfig(recompute=recompute))
+        for block in run.stage.network.blocks:
+            block.attn1.register_forward_hook(lambda *_, recompute=recompute: calls.append(recompute))
+        run.train(at_most=1)
+    assert calls.count(True) == 2 * calls.count(False) == 4
+
+
+def run_with(folder: Path, *, config: LoopConfig = SHORT, on_sheet=None, **engine) -> Run:
+    run = Run(TinyStage(), config, folder, engine=EngineConfig(**engine), on_sheet=on_sheet)
+    run.train()
+    return run
+
+
+def test_sheets_and_data_made_ahead_change_nothing(whole, tmp_path):
+    drawn = []
+
+    def sheet(path, state):
+        torch.randn(3)  # a sheet may even use the global generator
+        drawn.append((path.name, state["proj_out_2.weight"].clone()))
+
+    run = run_with(tmp_path, on_sheet=sheet, sheet_every=3, draw_ahead=True)
+    assert [name for name, _ in drawn] == ["000003.png", "000006.png"]
+    assert torch.equal(drawn[-1][1], whole.averaged_state()["proj_out_2.weight"])
+    assert losses_of(tmp_path) == losses_of(whole.folder) and same(weights(run), weights(whole))
+
+
+def test_the_last_checkpoints_are_kept_and_any_of_them_can_be_gone_on_from(whole, tmp_path):
+    run_with(tmp_path, keep=3)
+    steps = {path.name: torch.load(path, weights_only=True)["step"] for path in tmp_path.glob("*.pt")}
+    assert steps == {"checkpoint.pt": 6, "checkpoint-000004.pt": 4, "checkpoint-000002.pt": 2}
+    (tmp_path / "checkpoint.pt").unlink()
+    resumed = Run(TinyStage(), SHORT, tmp_path)
+    assert resumed.step == 4
+    resumed.train()
+    assert same(weights(resumed), weights(whole)) and losses_of(tmp_path) == losses_of(whole.folder)
+
+
+def test_a_full_disk_leaves_the_checkpoint_whole(tmp_path, monkeypatch):
+    run = Run(TinyStage(), SHORT, tmp_path)
+    run.train(at_most=2)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+
+    def full(state, file):
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        run.train()
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.glob("checkpoint*")) == ["checkpoint.pt"]
+
+
+def test_a_damaged_checkpoint_is_named_with_the_one_before_it(tmp_path):
+    run_with(tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(ValueError, match=r"checkpoint.pt is damaged .*; delete it to go on from .*checkpoint-000004.pt"):
+        Run(TinyStage(), SHORT, tmp_path)
+
+
+def test_a_checkpoint_of_another_preset_batch_or_optimizer_is_refused(tmp_path):
+    run_in(tmp_path, ALONE).train(at_most=1)
+    with pytest.raises(ValueError, match="holds preset 'tiny', expected 'other'"):
+        Run(TinyStage(), LOOP, tmp_path, preset="other")
+    larger = TinyStage()
+    larger.batch = 8
+    with pytest.raises(ValueError, match="holds batch 4, expected 8"):
+        Run(larger, LOOP, tmp_path)
+    with pytest.raises(ValueError, match="made with another optimizer than 'muon'"):
+        Run(TinyStage(), dataclasses.replace(LOOP, optimizer="muon"), tmp_path)
+
+
+def test_checkpoints_from_before_there_were_processes_can_be_resumed(whole, tmp_path):
+    """They hold one optimiser's state instead of a list, and neither preset nor batch."""
+    run_with(tmp_path, config=dataclasses.replace(SHORT, cooldown=0.0), keep=1)
+    expected = Run(TinyStage(), SHORT, tmp_path)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    (state["optimizer"],) = state["optimizer"]
+    old = tmp_path / "old"
+    old.mkdir()
+    torch.save({name: state[name] for name in state if name not in ("preset", "batch", "waited")}, old / "checkpoint.pt")
+    longer = dataclasses.replace(SHORT, steps=8)
+    resumed = [Run(TinyStage(), longer, folder, preset="any") for folder in (expected.folder, old)]
+    for run in resumed:
+        run.train()
+    assert same(*(weights(run) for run in resumed))
+
+
+def test_bfloat16_keeps_weights_and_their_average_in_float32(whole, tmp_path):
+    run = run_with(tmp_path, precision="bfloat16")
+    assert {value.dtype for value in run.averaged_state().values()} == {torch.float32}
+    assert losses_of(tmp_path) != losses_of(whole.folder)
+    assert losses_of(tmp_path) == pytest.approx(losses_of(whole.folder), rel=0.02)
+
+
+def test_muon_takes_the_matrices_of_the_blocks_and_learns(tmp_path):
+    run = run_with(tmp_path, config=dataclasses.replace(LOOP, optimizer="muon"))
+    _, muon = run.optimizers
+    taken = {id(parameter) for parameters in muon.param_groups for parameter in parameters["params"]}
+    named = {name for name, parameter in run.stage.network.named_parameters() if id(parameter) in taken}
+    assert named == {name for name, p in run.stage.network.named_parameters() if name.startswith("transformer_blocks.") and p.ndim == 2}
+    assert sum(losses_of(tmp_path)[-4:]) < 0.9 * sum(losses_of(tmp_path)[:4])
+    resumed = Run(TinyStage(), dataclasses.replace(LOOP, optimizer="muon"), tmp_path)
+    assert resumed.step == LOOP.steps
+
+
+class WithCritic(Stage):
+    """A network that wants to be 1 and a critic that wants to be 2."""
+
+    name, batch = "pair", 1
+
+    def __init__(self):
+        self.network, self.critic = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+
+    def draw(self, step, rows):
+        return torch.ones(1, 1)
+
+    def losses(self, drawn):
+        network, critic = (self.network(drawn) - 1).square().mean(), (self.critic(drawn) - 2).square().mean()
+        return {"loss": network + critic, "network": network, "critic": critic}
+
+
+def test_a_critic_is_optimised_and_resumed_beside_the_network(tmp_path):
+    loop = LoopConfig(steps=200, learning_rate=0.1, weight_decay=0.0, save_every=50)
+    run = Run(WithCritic(), loop, tmp_path)
+    run.train(at_most=77)
+    resumed = Run(WithCritic(), loop, tmp_path)
+    assert torch.equal(resumed.stage.critic.weight, run.stage.critic.weight)
+    resumed.train()
+    assert resumed.smoothed["network"] < 0.1 and float(resumed.stage.critic(torch.ones(1, 1)).detach()) == pytest.approx(2.0, abs=0.1)
+    assert set(resumed.averaged_state()) == {"weight", "bias"}
+
+
+def test_a_signal_saves_and_ends_with_a_message_and_its_number(tmp_path, monkeypatch, caplog):
+    from method_configs import ablations, training_command
+
+    monkeypatch.setitem(ablations.PRESETS, "toy", TOY)
+
+    def progress(stage, group):
+        return contextlib.nullcontext(lambda done, of, losses: os.kill(os.getpid(), signal.SIGTERM))
+
+    monkeypatch.setattr(training_command, "_progress", progress)
+    with caplog.at_level("INFO"), pytest.raises(SystemExit) as stopped:
+        training_command.train_preset("toy", tmp_path, device="cpu", stage="raymap-vae")
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert "raymap-vae stopped by signal 15 at step 1 of 4, which is saved" in caplog.text
+    assert torch.load(tmp_path / "raymap-vae" / "checkpoint.pt", weights_only=True)["step"] == 1
+    assert not (tmp_path / "raymap-vae" / "spread.json").exists()
+
+
+HEAVY = (
+    "kornia cv2 nerfstudio OpenImageIO matplotlib tyro rich scipy trimesh pyvista transformers torchvision gsplat viser tensorboard".split()
+)
+
+
+def test_training_needs_torch_and_little_else(tmp_path):
+    """In a process where all else cannot be imported: a whole training of a small preset, with sheets and TensorBoard asked for."""
+    script = f"""
+import sys
+for name in {[*HEAVY, "tensorboard"]!r}:
+    sys.modules[name] = None
+sys.path.insert(0, {str(ROOT / "tests")!r})
+from tiny_training import TOY
+from method_configs import ablations, train
+ablations.PRESETS["toy"] = TOY
+train.main(["toy", "--output", {str(tmp_path)!r}, "--device", "cpu", "--sheet-every", "2", "--tensorboard", "--no-half"])
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "no loss.png, because matplotlib is not installed" in done.stderr and "no 000002.png" in done.stderr
+    assert "no TensorBoard files" in done.stderr and "dit: step 4 of 4" in done.stderr
+    assert json.loads((tmp_path / "model" / "config.json").read_text())["info"]["preset"] == "toy"
