@@ -27,6 +27,7 @@ _LEAST_SIDE = 32  # optical flow needs as much
 _NEW_REFERENCE = 0.04  # once the picture has moved by this share of its longer side, motion is measured from here on
 _MOST_STEP = 0.25  # of the longer side: what optical flow says beyond that (a cut) is not believed
 _LEAST_COMPLETE = 0.95  # share of the frames announced by the header that must be there
+_HDR = (16, 18)  # transfer curves PQ and HLG
 _CACHE_BYTES = 256 * 2**20
 _logger = logging.getLogger(__name__)
 
@@ -41,6 +42,8 @@ class FilmFrame:
     """The film's own time stamp."""
     seconds: float
     """Time since the film's first frame."""
+    group: int
+    """How many key frames came before it, itself included: decoding can only begin at one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,15 +97,13 @@ class Film:
 
         So frames asked for in order of time are decoded once, and any other order costs at most the way from a key frame each.
         """
-        self._kept.clear()
-        wanted = {one.pts for one in self.frames if one.pts >= frame.pts}
         room = max(1, _CACHE_BYTES // (3 * math.prod(self.size)))
+        wanted = [one.pts for one in self.frames if one.group == frame.group and one.pts >= frame.pts][:room]
+        self._kept.clear()
         for found in _frames(self.path, [], from_pts=frame.pts):
-            if found.key_frame and self._kept:
-                break
             if found.pts in wanted:
                 self._kept[found.pts] = _pixels(found, self._display)
-            if len(self._kept) == min(room, len(wanted)):
+            if len(self._kept) == len(wanted) or (found.pts or 0) > wanted[-1]:
                 break
         if frame.pts not in self._kept:
             raise ValueError(f"film {self.path}: the frame at {frame.seconds:.2f} s can no longer be decoded; was the file changed?")
@@ -174,7 +175,7 @@ def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray,
     frames: list[FilmFrame] = []
     sharpness: list[float] = []
     way: list[float] = []
-    display, start, odometer = None, 0.0, _Odometer()
+    display, start, group, odometer = None, 0.0, 0, _Odometer()
     announced, pixel_aspect = _header(path)
     for frame in _frames(path, faults):
         if frame.pts is None or frame.time is None or (frames and frame.pts <= frames[-1].pts):
@@ -182,7 +183,10 @@ def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray,
             continue
         if display is None:
             display, start = Display.of(frame, pixel_aspect), frame.time
-        frames.append(FilmFrame(number=len(frames), pts=frame.pts, seconds=frame.time - start))
+            if frame.color_trc in _HDR:
+                _logger.warning("film %s has HDR colours, which are used as they are: pale; export it as SDR for better ones", path)
+        group += frame.key_frame
+        frames.append(FilmFrame(number=len(frames), pts=frame.pts, seconds=frame.time - start, group=group))
         grey = _small_grey(frame)
         sharpness.append(_sharpness(grey))
         way.append(odometer.moved(grey))
