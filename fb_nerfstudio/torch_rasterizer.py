@@ -186,7 +186,7 @@ def _ellipses(projection: Projection, opacities: Tensor, chosen: Tensor, tile_si
 
 def _finish(images: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor:
     """Put the background behind the colours, and turn accumulated into expected depth."""
-    if render_mode in ("RGB", "D") and backgrounds is None:
+    if backgrounds is None and not render_mode.endswith("ED"):
         return images
     color, depth = {"RGB": (images, None), "D": (None, images), "ED": (None, images)}.get(render_mode, (images[..., :-1], images[..., -1:]))
     if color is not None and backgrounds is not None:
