@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import torch
 
+from fb_core.checkpoint import ModelConfig
 from fb_core.inpainter import Fillerbuster
 from fb_core.memory import SIDE_MULTIPLE
 from fb_core.networks.vae import VAE, VAEConfig
@@ -20,10 +21,29 @@ _TRIAL_SECONDS = 0.05
 def expected_seconds(
     model: Fillerbuster, *, views: int, known: int, side: int, sampling: SamplingConfig, recovers_rays: bool = False
 ) -> float:
-    """Seconds that completing square views takes, right within a factor of two or so.
+    """:func:`seconds_of` a model that is loaded; where it stands decides the machine."""
+    return seconds_of(
+        model.config, model.device, model.dit.dtype, views=views, known=known, side=side, sampling=sampling, recovers_rays=recovers_rays
+    )
+
+
+def seconds_of(
+    model: ModelConfig,
+    device: torch.device,
+    dtype: torch.dtype,
+    *,
+    views: int,
+    known: int,
+    side: int,
+    sampling: SamplingConfig,
+    recovers_rays: bool = False,
+) -> float:
+    """Seconds that completing square views takes, right within a factor of two or so; no weights are needed to tell.
 
     Args:
-        model: where it stands decides the machine.
+        model: the networks' architecture.
+        device: where they run.
+        dtype: the transformer's precision.
         views: of the sequence.
         known: of them have a picture.
         side: of the views in pixels.
@@ -31,18 +51,16 @@ def expected_seconds(
         recovers_rays: raymaps are decoded instead of pictures.
     """
     size = -(-side // SIDE_MULTIPLE) * SIDE_MULTIPLE
-    config = model.config.transformer
-    tokens = (size // (model.config.image_vae.factor * config.patch)) ** 2
+    config = model.transformer
+    tokens = (size // (model.image_vae.factor * config.patch)) ** 2
     window = min(sampling.window or views, views)
     passes = sampling.steps * (sampling.rounds * -(-views // window) if window < views else 1)
     branches = 1 if sampling.guidance_known == sampling.guidance_unknown == 1 else 2
     per_token = 2 * (4 + 2 * config.mlp_ratio) * config.width**2 + 4 * config.width * tokens * window  # projections; attention
     a_pass = config.depth * per_token * tokens * window
-    encoded = views * (_flops(model.config.image_vae, size)[0] + _flops(model.config.raymap_vae, size)[0])
-    decoded = (views if recovers_rays else views - known) * _flops(
-        model.config.raymap_vae if recovers_rays else model.config.image_vae, size
-    )[1]
-    rate = _rate(str(model.device), model.dit.dtype)
+    encoded = views * (_flops(model.image_vae, size)[0] + _flops(model.raymap_vae, size)[0])
+    decoded = (views if recovers_rays else views - known) * _flops(model.raymap_vae if recovers_rays else model.image_vae, size)[1]
+    rate = _rate(str(device), dtype)
     return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
 
 

@@ -195,6 +195,8 @@ def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainte
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left."""
     context = max(len(plan.context_of(one)) for one in plan.rounds)
     asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
+    left = [one for one in plan.rounds if done is None or one.number not in done.rounds]
+    sequences = [(len(plan.context_of(one)) + (0 if one.role == ANCHOR else _anchors(plan)), len(one.cameras)) for one in left]
     there = "" if done is None else f"; {len(done)} of these views are there already"
     along = "" if config.camera_path is None else f" along {config.camera_path.name}"
     sequence = context + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
@@ -202,8 +204,22 @@ def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainte
     return (
         f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
         f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {passes}, "
-        f"conditioned on {context} of {plan.captured} captured views{asked}{there}."
+        f"conditioned on {context} of {plan.captured} captured views{asked}{there}{expectation(sequences, plan.size, config, model)}."
     )
+
+
+def expectation(sequences: Sequence[tuple[int, int]], size: int, config: CompletionConfig, model: Inpainter) -> str:
+    """What sequences of (known, generated) views will take, as far as the model can tell; for example ``; about 40 s, 0.6 GiB``."""
+    expected = getattr(model, "expected", None)
+    if expected is None or not sequences:
+        return ""
+    sampling, prompted = config.sampling(model.recommended_sampling), bool(config.prompt)
+    each = [
+        expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted) for known, generated in sequences
+    ]
+    seconds, most = sum(one[0] for one in each), max(one[1] for one in each)
+    takes = f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    return f"; about {takes}, up to {max(most / 2**30, 0.1):.1f} GiB of memory"
 
 
 def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:

@@ -234,7 +234,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             plan = plan_completion(cameras, points, config, size=size, known=self._known_parts)
         done, _ = _without_requested(self._bank)
         if plan.rounds:
-            told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
+            with refusing():
+                told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
             CONSOLE.print(told)
             context = LazyViews(lambda index: self._captured_view(index, cameras[index]), plan.context)
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))

@@ -21,7 +21,16 @@ from fb_core.geometry.paths import CaptureShape, strided_subset
 from fb_core.masks import grow_hole
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import INPAINTED, CompletedViews, Origin
-from fb_nerfstudio.completion import CapturedView, Inpainter, fitted_rectangle, fitted_view, model_name, open_cache, round_images
+from fb_nerfstudio.completion import (
+    CapturedView,
+    Inpainter,
+    expectation,
+    fitted_rectangle,
+    fitted_view,
+    model_name,
+    open_cache,
+    round_images,
+)
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, PlannedRound, round_seed, shell_of, thinned_points
 from fb_nerfstudio.seams import without_seams
@@ -127,7 +136,8 @@ def announcement_of_inpainting(plan: CompletionPlan, config: CompletionConfig, m
     rim = f", holes grown by {config.masked.dilate} pixels" if config.masked.dilate else ""
     return (
         f"Inpainting {len(plan.context)} equally spaced of {plan.captured} captured views{asked} with {model_name(config, model)} "
-        f"({model.model_hash[:8]}) {how}{windows} at {plan.size}x{plan.size} pixels{rim}."
+        f"({model.model_hash[:8]}) {how}{windows} at {plan.size}x{plan.size} pixels{rim}"
+        f"{expectation([(0, len(plan.context))], plan.size, config, model)}."
     )
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import torch
 
-from fb_core import checkpoint
+from fb_core import checkpoint, memory
+from fb_core.duration import seconds_of
 from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster, SamplingConfig
 from fb_core.views import Views
 
@@ -20,7 +21,7 @@ class LazyInpainter:
         self._folder, self._device, self._text_encoder = folder, device, text_encoder
         self._model: Fillerbuster | None = None
         path = BUNDLED_MODEL if folder is None else folder
-        self._info = checkpoint.read_config(path)[1]
+        self._config, self._info = checkpoint.read_config(path)
         self.model_hash = checkpoint.model_hash(path)
 
     @property
@@ -37,6 +38,16 @@ class LazyInpainter:
     def loaded(self) -> bool:
         """Whether the weights have been needed so far."""
         return self._model is not None
+
+    def expected(self, *, views: int, known: int, size: int, sampling: SamplingConfig, prompted: bool = False) -> tuple[float, int]:
+        """About how many seconds, and at most how many bytes, completing square views will take, ``known`` of which need no decoding.
+
+        No weights are loaded to tell. Raises ValueError when the memory budget does not suffice.
+        """
+        device, dtype = torch.device(self._device), torch.float32
+        needed = memory.estimate(views, (size, size), dtype, model=self._config, sampling=sampling, prompted=prompted)
+        seconds = seconds_of(self._config, device, dtype, views=views, known=known, side=size, sampling=sampling)
+        return seconds, needed.peak
 
     def complete(
         self,

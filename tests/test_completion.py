@@ -272,3 +272,40 @@ def test_options_that_are_not_given_come_from_the_model():
     assert CompletionConfig().sampling(recommended) == recommended
     given = CompletionConfig(steps=5, guidance_unknown=3.0).sampling(recommended)
     assert (given.steps, given.guidance_unknown, given.guidance_known, given.solver) == (5, 3.0, 1.0, "euler")
+
+
+# ---- what is said beforehand ----------------------------------------------------------------------------------------
+
+
+def test_the_announcement_tells_model_views_passes_seconds_and_memory():
+    """Of what is left to do, from the model's own estimate; nothing is made up for a model that cannot tell."""
+    config = small(anchor_views=4, densify_rounds=2, densify_views=3)
+    plan = plan_completion(room_cameras(), box_points(), config, size=16)
+    asked: list[tuple[int, int]] = []
+
+    class Telling(MeanFiller):
+        def expected(self, *, views, known, size, sampling, prompted):
+            asked.append((views, known))
+            return 50.0 * len(asked), views * 2**28
+
+    context = len(plan.context)
+    text = announcement(plan, config, Telling())
+    assert asked == [(context + 4, context), (context + 4 + 3, context + 4), (context + 4 + 3, context + 4)]
+    gib = max(views for views, _ in asked) / 4
+    assert text.endswith(f"; about 5 min, up to {gib:.1f} GiB of memory.") and "10 new views of 16x16 pixels in 3 passes" in text
+    asked.clear()
+    views = next(run_completion(plan, [captured(room_cameras())[i] for i in plan.context], MeanFiller(), config))
+    announcement(plan, config, Telling(), done=views)
+    assert len(asked) == 2, "the anchors are there already"
+    assert "about" not in announcement(plan, config, MeanFiller())
+
+
+def test_the_lazy_model_tells_without_its_weights(tmp_path: Path):
+    from tiny_models import save_tiny_model
+
+    from fb_nerfstudio.lazy_inpainter import LazyInpainter
+
+    model = LazyInpainter(save_tiny_model(tmp_path / "model", image_size=16), "cpu")
+    sampling = model.recommended_sampling
+    few, many = (model.expected(views=views, known=2, size=16, sampling=sampling) for views in (4, 16))
+    assert not model.loaded and 0 < few[0] < many[0] and 0 < few[1] < many[1]
