@@ -23,6 +23,7 @@ from fb_core.views import Views
 
 ROUNDS = 8
 """Random partitions into windows that are averaged in every step (paper)."""
+_TOLD = 1e-4  # relative deviation of told focal lengths: they stand, because raymaps err by far more than they scatter
 _ANCHOR_SHARE = 0.25  # of a later window's views are photos that have a camera already
 
 
@@ -187,7 +188,7 @@ def _solved(photos: Sequence[Photo], squares: Sequence[Square], raymaps: Float[T
             raymaps[members],
             principal=torch.stack([squares[index].principal for index in members]),
             focal=torch.tensor([_told_focal(photos[index], squares[index]) for index in members], dtype=torch.float64),
-            solving=PoseSolving(focal="shared", square_pixels=True),
+            solving=PoseSolving(focal="shared", square_pixels=True, focal_deviation=_TOLD),
         )
         for place, index in enumerate(members):
             reasons[index] = found.reasons[place]

@@ -38,7 +38,7 @@ class Registration:
     verdicts: tuple[str, ...]
     """"known" (it was given), "ok", "doubtful" (there is a camera, but little speaks for it), or why there is none."""
     reasons: tuple[str, ...]
-    """A sentence for a person; empty where all is well."""
+    """A sentence for a person: what speaks against the camera, or is worth knowing; empty where all is well."""
     residuals_degrees: tuple[float, ...]
     """How badly a photo's rays or features fit its camera; NaN where that is not known."""
     raymaps: Float[Tensor, "n 6 h w"] | None
@@ -110,7 +110,7 @@ def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
         deviations = centers.new_tensor([off for _, off in placed])
         arrangement = arrangement_of(centers, deviations, precision=torch.finfo(torch.float32).eps)
     return Registration(
-        cameras=_in_one_world(photos, found.cameras),
+        cameras=_in_one_world(photos, found.cameras, verdicts),
         verdicts=tuple(verdicts),
         reasons=tuple(reasons),
         residuals_degrees=tuple(found.residuals_degrees),
@@ -122,7 +122,7 @@ def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
 def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Similarity | None) -> Registration:
     known = [photo.camera is not None for photo in photos]
     cameras, verdicts, reasons = list[Pinholes | None](), list[str](), list[str]()
-    for photo, camera, reason in zip(photos, found.cameras, found.reasons, strict=True):
+    for photo, camera, trusted, reason in zip(photos, found.cameras, found.trusted, found.reasons, strict=True):
         if photo.camera is not None:
             camera, verdict, reason = photo.camera, "known", ""
         elif camera is None:
@@ -130,12 +130,12 @@ def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Simil
         elif any(known) and to_known is None:
             camera, verdict, reason = None, "no camera", "shares no features with the photos whose cameras are known"
         else:
-            camera, verdict = camera if to_known is None else to_known.cameras(camera), "doubtful" if reason else "ok"
+            camera, verdict = camera if to_known is None else to_known.cameras(camera), "ok" if trusted else "doubtful"
         cameras.append(camera)
         verdicts.append(verdict)
         reasons.append(reason)
     return Registration(
-        cameras=_in_one_world(photos, cameras),
+        cameras=_in_one_world(photos, cameras, verdicts),
         verdicts=tuple(verdicts),
         reasons=tuple(reasons),
         residuals_degrees=tuple(found.residuals_degrees),
@@ -144,10 +144,13 @@ def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Simil
     )
 
 
-def _in_one_world(photos: Sequence[Photo], cameras: Sequence[Pinholes | None]) -> tuple[Pinholes | None, ...]:
-    """As they are where some are given (the frame is theirs already), else upright."""
-    placed = [camera for camera in cameras if camera is not None]
-    if not placed or any(photo.camera is not None for photo in photos):
+def _in_one_world(photos: Sequence[Photo], cameras: Sequence[Pinholes | None], verdicts: Sequence[str]) -> tuple[Pinholes | None, ...]:
+    """As they are where some are given (the frame is theirs already), else upright, by those that are trusted if there are two."""
+    if any(photo.camera is not None for photo in photos):
+        return tuple(cameras)
+    trusted = [camera for camera, verdict in zip(cameras, verdicts, strict=True) if camera is not None and verdict == "ok"]
+    placed = trusted if len(trusted) > 1 else [camera for camera in cameras if camera is not None]
+    if not placed:
         return tuple(cameras)
     to_world = upright(placed)
     return tuple(None if camera is None else to_world.cameras(camera) for camera in cameras)

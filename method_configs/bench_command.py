@@ -17,6 +17,7 @@ _ALWAYS_SHOWN = (
     *("method", "room", "covered_psnr", "uncovered_psnr", "uncovered_hole_share", "consistency_psnr"),
     *("block_psnr", "seconds", "peak_gib"),
     *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
+    *("rotation_degrees", "center", "focal_percent", "found_share", "trusted_share", "rra_15", "rta_15", "rooms"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )
 

@@ -24,6 +24,7 @@ from method_configs.bench_splat import Splat
 from method_configs.evaluation_command import Rooms
 from method_configs.methods_benchmark import Methods
 from method_configs.scaling_evaluation import Scaling
+from method_configs.uncalibrated_evaluation import Uncalibrated
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -141,6 +142,7 @@ def complete(
     text_encoder: Path | None = None,
     device: str | None = None,
     fps: float = 8.0,
+    check: bool = True,
     overwrite: bool = False,
 ) -> None:
     """Complete a scene from photos alone: find their cameras, generate views along a path, leave a capture for ns-train.
@@ -163,6 +165,7 @@ def complete(
         text_encoder: Folder with the CLIP text model, which prompts need.
         device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
         fps: Pictures per second of the film.
+        check: Look for the cameras of photos and new views once more, and report how far they are off (self-consistency).
         overwrite: Replace an earlier output there.
     """
     from method_configs.complete_command import complete_scene
@@ -184,6 +187,7 @@ def complete(
         text_encoder=text_encoder,
         device=device,
         fps=fps,
+        check=check,
     )
     complete_scene(source, output, options, overwrite=overwrite)
 
@@ -262,7 +266,9 @@ def bench(
 def evaluate(
     *,
     evaluation: tyro.conf.OmitArgPrefixes[
-        Annotated[Rooms, tyro.conf.subcommand("rooms")] | Annotated[Scaling, tyro.conf.subcommand("scaling")]
+        Annotated[Rooms, tyro.conf.subcommand("rooms")]
+        | Annotated[Scaling, tyro.conf.subcommand("scaling")]
+        | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

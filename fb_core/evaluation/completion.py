@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
-from fb_core.data.rooms import FAMILIES, make_room
+from fb_core.data.rooms import FAMILIES, Room, make_room
 from fb_core.evaluation.image_metrics import psnr
 from fb_core.evaluation.reprojection import inpainted, reproject
 from fb_core.geometry.cameras import Pinholes
@@ -71,11 +71,15 @@ class RoomViews:
         return RoomViews(images=self.images[part], cameras=self.cameras[places], depth=self.depth[part])
 
 
+def unseen_house(*, family: str, seed: int, number: int) -> Room:
+    """A room outside every training."""
+    return make_room(_FIRST_UNSEEN_ROOM + 1000 * seed + number, FAMILIES[family])
+
+
 def unseen_room(*, family: str, seed: int, number: int, views: int, size: int) -> RoomViews:
-    """A room outside every training, seen by cameras as in training."""
-    draw = _FIRST_UNSEEN_ROOM + 1000 * seed + number
-    room = make_room(draw, FAMILIES[family])
-    cameras = training_cameras(room, views, size=size, generator=torch.Generator().manual_seed(draw))
+    """That room, seen by cameras as in training."""
+    room = unseen_house(family=family, seed=seed, number=number)
+    cameras = training_cameras(room, views, size=size, generator=torch.Generator().manual_seed(room.seed))
     rendered = render(room, cameras, supersample=2)
     return RoomViews(images=rendered.rgb.clamp(0, 1), cameras=cameras, depth=rendered.depth)
 

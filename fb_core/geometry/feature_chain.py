@@ -26,6 +26,7 @@ FOCAL_GUESS = 1.2
 _GUESSES = (FOCAL_GUESS, 0.7)  # the second is a phone's (26 mm on film)
 _FOCAL_TOLD, _FOCAL_GUESSED = 0.02, 0.5  # deviations of the logarithm
 _PANORAMA = 0.8  # share of all matches that rotations alone explain, from which nothing else is looked for
+_COPIES_DEGREES = 0.2  # photos in one place that are turned by less are copies of one another
 _STARTS = 3  # pairs that may begin
 _GOOD_ANGLE_DEGREES = 8.0  # of a starting pair; wider ones are no better
 _LEAST_ANGLE_DEGREES = 1.5  # between the rays of a point
@@ -40,8 +41,10 @@ class FeatureCameras:
 
     cameras: list[Pinholes | None]
     """Each a batch of one, float64, of the whole photo, in a world of their own; None where features do not tell."""
+    trusted: list[bool]
+    """Whether there is a camera beyond doubt."""
     reasons: list[str]
-    """What is to be doubted; empty where all is well."""
+    """What is to be doubted, or worth knowing; empty where all is well."""
     residuals_degrees: list[float]
     """Root mean square of the angles by which features miss their points, per axis; NaN where there is no camera."""
     arrangement: Arrangement
@@ -239,7 +242,8 @@ class _Chain:
             residuals.append(float(np.degrees(np.sqrt(np.square(own).mean()) / focal)))
             few = len(own) < _TRUSTED_POINTS
             reasons.append(f"only {len(own)} points are seen in it and in others, expected {_TRUSTED_POINTS}" if few else "")
-        return FeatureCameras(cameras=cameras, reasons=reasons, residuals_degrees=residuals, arrangement=Arrangement.APART)
+        trusted = [not reason for reason in reasons]
+        return FeatureCameras(cameras=cameras, trusted=trusted, reasons=reasons, residuals_degrees=residuals, arrangement=Arrangement.APART)
 
     def _focal_of(self, observations: Int[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         return self.focal[self.lens[self.owner[observations]]]
@@ -275,12 +279,15 @@ def _one_place(photos: Sequence[PhotoFeatures], panorama: Panorama) -> FeatureCa
         None if turn is None else _camera(photo, turn, np.zeros(3), focal)
         for photo, turn, focal in zip(photos, panorama.rotations, panorama.focal, strict=True)
     ]
-    here = "all photos that match it were taken in one place, which tells no distances"
+    turns = [turn for turn in panorama.rotations if turn is not None]
+    copies = all(np.trace(turn @ turns[0].T) > 1 + 2 * np.cos(np.radians(_COPIES_DEGREES)) for turn in turns)
+    here = "shows the same as the others, from the same place" if copies else "taken in the same place as the others: no distances"
     return FeatureCameras(
         cameras=cameras,
+        trusted=[camera is not None and not copies for camera in cameras],
         reasons=["shares too few features with the others" if camera is None else here for camera in cameras],
         residuals_degrees=[float("nan")] * len(photos),
-        arrangement=Arrangement.NO_CAMERA if all(camera is None for camera in cameras) else Arrangement.ONE_PLACE,
+        arrangement=Arrangement.ONE_PLACE if turns else Arrangement.NO_CAMERA,
     )
 
 
