@@ -111,8 +111,9 @@ def _gradient_mirror(source: Tensor, device: torch.device) -> Tensor:
 
     def follow(gradient: Tensor) -> None:
         mirror.grad = gradient.to(device)
-        if hasattr(source, "absgrad"):
-            mirror.absgrad = source.absgrad.to(device)
+        absolute = getattr(source, "absgrad", None)
+        if absolute is not None:
+            setattr(mirror, "absgrad", absolute.to(device))  # noqa: B010 (tensors declare no such attribute; gsplat's strategies read it)
 
     source.register_hook(follow)
     return mirror

@@ -49,24 +49,35 @@ class Lens:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shapes:
-    """The extent of n Gaussians in columns: unit quaternions and scales, or else covariances."""
+class Axes:
+    """The extent of n Gaussians in columns, by their axes."""
 
-    unit: Float[Tensor, "4 n"] | None = None
-    inverse_length: Float[Tensor, " n"] | None = None
+    unit: Float[Tensor, "4 n"]
+    """Unit quaternions (wxyz)."""
+    inverse_length: Float[Tensor, " n"]
     """1/|q| of the quaternions as given; 0 for a zero quaternion, which stands for the identity and gets no gradient."""
-    rotation: Float[Tensor, "3 3 n"] | None = None
+    rotation: Float[Tensor, "3 3 n"]
     """Q."""
-    scales: Float[Tensor, "3 n"] | None = None
-    covariance: Float[Tensor, "3 3 n"] | None = None
+    scales: Float[Tensor, "3 n"]
 
-    @classmethod
-    def of(cls, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Shapes:
-        """From quaternions (wxyz) of any length [n, 4] and scales [n, 3], or from covariances [n, 3, 3]."""
-        if covars is not None:
-            return cls(covariance=covars.permute(1, 2, 0).contiguous())
-        unit, inverse_length = unit_quaternions(quats)
-        return cls(unit=unit, inverse_length=inverse_length, rotation=rotations(unit), scales=scales.t().contiguous())
+
+@dataclass(frozen=True, kw_only=True)
+class Covariances:
+    """The extent of n Gaussians in columns, by covariances C that were given."""
+
+    covariance: Float[Tensor, "3 3 n"]
+
+
+Shapes = Axes | Covariances
+
+
+def shapes_of(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Shapes:
+    """From quaternions (wxyz) of any length [n, 4] and scales [n, 3], or, where given, from covariances [n, 3, 3]."""
+    if covars is not None:
+        return Covariances(covariance=covars.permute(1, 2, 0).contiguous())
+    assert quats is not None and scales is not None, "the rasterizer has checked that it got either"
+    unit, inverse_length = unit_quaternions(quats)
+    return Axes(unit=unit, inverse_length=inverse_length, rotation=rotations(unit), scales=scales.t().contiguous())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +167,7 @@ def footprint(means: Float[Tensor, "n 3"], shapes: Shapes, viewmat: Float[Tensor
     ground = means.new_empty(2, 3, means.shape[0])
     torch.mul(rotation[0][:, None], jx, out=ground[0]).addcmul_(rotation[2][:, None], jxz)
     torch.mul(rotation[1][:, None], jy, out=ground[1]).addcmul_(rotation[2][:, None], jyz)
-    if shapes.covariance is None:
+    if isinstance(shapes, Axes):
         spread = through(ground, shapes.rotation)
         p, q = spread * shapes.scales
         a, b, c, sharp = (p * p).sum(dim=0), (p * q).sum(dim=0), (q * q).sum(dim=0), cross(p, q).square_().sum(dim=0)

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_nerfstudio.torch_footprint import Footprint, Lens, Shapes, compensation, cross, footprint
+from fb_nerfstudio.torch_footprint import Axes, Footprint, Lens, Shapes, compensation, cross, footprint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ def footprint_gradient(
     view = footprint(means, shapes, viewmat, lens, blur)
     slope = _compensation_slope(view, floor, incoming.compensations)
     quats = scales = covars = None
-    if shapes.covariance is None:
+    if isinstance(shapes, Axes):
         v_ground, quats, scales = _axes_gradient(view, shapes, blur, slope, incoming.conics)
     else:
         v_ground, covars = _covariance_gradient(view, blur, slope, incoming.conics)
@@ -81,8 +81,7 @@ def _compensation_slope(view: Footprint, floor: float, v: Tensor | None) -> tupl
 def _conic_matrix(v_conics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Columns of the symmetric gradient matrix."""
     columns = v_conics.t().contiguous()
-    columns[1].mul_(0.5)
-    return columns.unbind(0)
+    return columns[0], columns[1].mul_(0.5), columns[2]
 
 
 def _times(xx: Tensor, xy: Tensor, yy: Tensor, rows: Float[Tensor, "2 3 n"]) -> Float[Tensor, "2 3 n"]:
@@ -93,13 +92,13 @@ def _times(xx: Tensor, xy: Tensor, yy: Tensor, rows: Float[Tensor, "2 3 n"]) -> 
     return out
 
 
-def _axes_gradient(view: Footprint, shapes: Shapes, blur: float, slope: tuple[Tensor, Tensor] | None, v_conics: Tensor | None):
+def _axes_gradient(view: Footprint, axes: Axes, blur: float, slope: tuple[Tensor, Tensor] | None, v_conics: Tensor | None):
     """Gradients of G [2, 3, n], quaternions [n, 4] and scales [n, 3].
 
     With V the gradient of M, the gradient of Q's body axes is N = H^T V H (3x3): scales get 2 s_k N_kk, a rotation about
     axis 3 gets 2 N_12 (s_1^2 - s_2^2), and so on; G gets 2 V H S^2 Q^T.
     """
-    H, squares, over = view.spread, shapes.scales.square(), view.determinant.reciprocal()
+    H, squares, over = view.spread, axes.scales.square(), view.determinant.reciprocal()
     minors = cross(H[0], H[1])
     Y = torch.stack([cross(squares * H[1], minors), cross(minors, squares * H[0])]).add_(H, alpha=blur).mul_(over)  # X H
     VH = torch.zeros_like(H)  # V H, and N = H^T V H
@@ -117,17 +116,17 @@ def _axes_gradient(view: Footprint, shapes: Shapes, blur: float, slope: tuple[Te
         N_diagonal.add_((H * U).sum(dim=0))
         for o, (k, m) in enumerate(pairs):
             N_corner[o].addcmul_(H[0, k], U[0, m]).addcmul_(H[1, k], U[1, m])
-    v_scales = N_diagonal.mul_(shapes.scales).mul_(2.0).t()
+    v_scales = N_diagonal.mul_(axes.scales).mul_(2.0).t()
     torque = torch.stack([2 * N_corner[o] * (squares[k] - squares[m]) for o, (k, m) in enumerate(pairs)])
     VH.mul_(squares).mul_(2.0)
-    v_ground = torch.stack([(row * shapes.rotation).sum(dim=1) for row in VH.unbind(0)])
-    return v_ground, _quaternion_gradient(shapes, torque), v_scales
+    v_ground = torch.stack([(row * axes.rotation).sum(dim=1) for row in VH.unbind(0)])
+    return v_ground, _quaternion_gradient(axes, torque), v_scales
 
 
-def _quaternion_gradient(shapes: Shapes, torque: Float[Tensor, "3 n"]) -> Float[Tensor, "n 4"]:
+def _quaternion_gradient(axes: Axes, torque: Float[Tensor, "3 n"]) -> Float[Tensor, "n 4"]:
     """2 q (0, torque) / |q|: a turn w about the body's axes moves the unit quaternion by q (0, w) / 2."""
-    w, x, y, z = shapes.unit.unbind(0)
-    tx, ty, tz = (torque * (2.0 * shapes.inverse_length)).unbind(0)
+    w, x, y, z = axes.unit.unbind(0)
+    tx, ty, tz = (torque * (2.0 * axes.inverse_length)).unbind(0)
     return torch.stack(
         [
             -(x * tx) - y * ty - z * tz,

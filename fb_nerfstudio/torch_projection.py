@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from fb_nerfstudio.single_thread import single_thread
-from fb_nerfstudio.torch_footprint import Footprint, Lens, Shapes, compensation, footprint
+from fb_nerfstudio.torch_footprint import Footprint, Lens, compensation, footprint, shapes_of
 from fb_nerfstudio.torch_footprint_gradient import ScreenGradient, footprint_gradient
 
 ALPHA_MIN = 1.0 / 255.0
@@ -134,7 +134,7 @@ class _Project(torch.autograd.Function):
         floor, square = settings.semantics.compensation_floor, settings.semantics.square_boxes
         with single_thread():
             lenses = [Lens.of(K, settings.width, settings.height) for K in Ks]
-            shapes = Shapes.of(quats, scales, covars)
+            shapes = shapes_of(quats, scales, covars)
             means2d, conics = means.new_empty(cameras, n, 2), means.new_empty(cameras, n, 3)
             depths, compensations, determinants = (means.new_empty(cameras, n) for _ in range(3))
             radii = torch.zeros((cameras, n) if square else (cameras, n, 2), dtype=torch.int32, device=means.device)
@@ -177,8 +177,8 @@ class _Project(torch.autograd.Function):
 
                 arriving = dict(means2d=v_means2d, conics=v_conics, depths=v_depths, compensations=v_compensations)
                 incoming = ScreenGradient(**{name: None if v is None else of(v[camera]) for name, v in arriving.items()})
-                shapes, floor = Shapes.of(of(quats), of(scales), of(covars)), settings.semantics.compensation_floor
-                leaving = footprint_gradient(of(means), shapes, viewmats[camera], lens, settings.eps2d, floor, incoming)
+                shapes, floor = shapes_of(of(quats), of(scales), of(covars)), settings.semantics.compensation_floor
+                leaving = footprint_gradient(means.index_select(0, rows), shapes, viewmats[camera], lens, settings.eps2d, floor, incoming)
                 parts = (leaving.means, leaving.quats, leaving.scales, leaving.covars)
                 for total, part in zip(totals, parts, strict=False):
                     if total is not None and part is not None:

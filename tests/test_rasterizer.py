@@ -37,6 +37,17 @@ def test_block_and_list_budgets_do_not_change_the_result(monkeypatch):
             assert relative(got, expected) < 1e-10
 
 
+@pytest.mark.parametrize("rows", [100, 2**20])
+def test_a_second_backward_gives_the_same_gradients(monkeypatch, rows: int):
+    """Backward uses what forward kept, lists of one slab or of the last of many, and must leave it as it was."""
+    monkeypatch.setattr(torch_rasterizer, "CompositingSettings", partial(CompositingSettings, rows_per_list=rows))
+    leaves = with_gradients(scene(n=60))
+    images, alphas, _ = rasterization(**leaves)
+    loss = images.square().sum() + alphas.sum()
+    first, second = (torch.autograd.grad(loss, [leaves[name] for name in INPUTS], retain_graph=True) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
 def test_order_of_gaussians_does_not_matter():
     inputs = scene(n=50)
     shuffled = dict(inputs)
