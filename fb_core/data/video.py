@@ -100,13 +100,15 @@ class Film:
         room = max(1, _CACHE_BYTES // (3 * math.prod(self.size)))
         wanted = [one.pts for one in self.frames if one.group == frame.group and one.pts >= frame.pts][:room]
         self._kept.clear()
-        for found in _frames(self.path, [], from_pts=frame.pts):
-            if found.pts in wanted:
-                self._kept[found.pts] = _pixels(found, self._display)
-            if len(self._kept) == len(wanted) or (found.pts or 0) > wanted[-1]:
-                break
-        if frame.pts not in self._kept:
-            raise ValueError(f"film {self.path}: the frame at {frame.seconds:.2f} s can no longer be decoded; was the file changed?")
+        for begin in (frame.pts, None):  # from the start, should a container lead to a wrong place
+            for found in _frames(self.path, [], from_pts=begin):
+                if found.pts in wanted:
+                    self._kept[found.pts] = _pixels(found, self._display)
+                if len(self._kept) == len(wanted) or (found.pts or 0) > wanted[-1]:
+                    break
+            if frame.pts in self._kept:
+                return
+        raise ValueError(f"film {self.path}: the frame at {frame.seconds:.2f} s can no longer be decoded; was the file changed?")
 
 
 def read_film(path: Path, most: int) -> Film:
@@ -237,7 +239,7 @@ def _sharpness(grey: np.ndarray) -> float:
 
 
 def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> Iterator[Any]:
-    """PyAV's frames in order of time, one at a time. What goes wrong after the opening is told in ``faults``.
+    """PyAV's intact frames in order of time, one at a time. What goes wrong after the opening is told in ``faults``.
 
     Args:
         path: the film.
@@ -252,14 +254,21 @@ def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> It
         if from_pts is not None:
             container.seek(from_pts, stream=stream, backward=True)
         packets = container.demux(stream)
+        intact = True
         while True:
             try:
                 packet = next(packets, None)
                 decoded = [] if packet is None else packet.decode()
             except FFmpegError as error:
                 faults.append(str(error))
+                intact = False
                 continue  # after an error of the container itself there is no next packet
-            yield from (frame for frame in decoded if not frame.is_corrupt)
+            for frame in decoded:
+                intact = not frame.is_corrupt and (intact or frame.key_frame)  # what follows a damaged frame inherits the damage
+                if intact:
+                    yield frame
+                else:
+                    faults.append("some frames are damaged")
             if packet is None:
                 return
 
