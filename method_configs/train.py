@@ -23,24 +23,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for package in ("fb_core", "method_configs"):
         logging.getLogger(package).setLevel(logging.INFO if os.environ.get("RANK", "0") == "0" else logging.WARNING)
     try:
-        train_preset(**vars(_parser().parse_args(arguments)))
+        train_preset(**vars(parser().parse_args(arguments)))
     except (ValueError, FloatingPointError, OSError) as error:
         sys.exit(f"Error: {error}")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m method_configs.train", description=__doc__)
+def parser() -> argparse.ArgumentParser:
+    """Options from the signature of `train_preset`."""
+    options = argparse.ArgumentParser(prog="python -m method_configs.train", description=__doc__)
     types = typing.get_type_hints(train_preset)
     for name, parameter in inspect.signature(train_preset).parameters.items():
         flag = "--" + name.replace("_", "-")
         if name == "preset":
-            parser.add_argument(name)
+            options.add_argument(name)
         elif types[name] is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=parameter.default)
+            options.add_argument(flag, action=argparse.BooleanOptionalAction, default=parameter.default)
         else:
             kind = next(kind for kind in (Path, int, float, str) if kind is types[name] or kind in typing.get_args(types[name]))
-            parser.add_argument(flag, type=kind, required=parameter.default is parameter.empty, default=parameter.default)
-    return parser
+            options.add_argument(flag, type=kind, required=parameter.default is parameter.empty, default=parameter.default)
+    return options
 
 
 if __name__ == "__main__":

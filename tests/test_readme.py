@@ -12,7 +12,7 @@ import pytest
 from method_configs import commands
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ["README.md", "docs/quickstart.md", "docs/gpu.md", "docs/weights.md", "docs/speed_and_accuracy.md"]
+PAGES = ["README.md", "docs/quickstart.md", "docs/gpu.md", "docs/training.md", "docs/weights.md", "docs/speed_and_accuracy.md"]
 
 
 def commands_of(page: str) -> list[str]:
@@ -27,7 +27,7 @@ ALL = [(page, line) for page in PAGES for line in commands_of(page)]
 
 def test_the_pages_have_commands():
     programs = {shlex.split(line)[0] for _, line in ALL}
-    assert {"make", "fillerbuster", "ns-train", "ns-viewer", "ns-eval", "ns-render", "ns-export"} == programs
+    assert {"make", "fillerbuster", "ns-train", "ns-viewer", "ns-eval", "ns-render", "ns-export", "python", "torchrun"} == programs
 
 
 @pytest.mark.parametrize(("page", "line"), [one for one in ALL if one[1].startswith("make ")])
@@ -46,6 +46,19 @@ def test_fillerbuster_accepts(page, line, monkeypatch):
     arguments = shlex.split(line)[1:]
     commands.main(arguments)
     assert called == [arguments[0]]
+
+
+@pytest.mark.parametrize(("page", "line"), [one for one in ALL if "-m method_configs.train " in one[1]])
+def test_the_entrance_without_tyro_accepts(page, line):
+    from method_configs.ablations import PRESETS
+    from method_configs.train import parser
+
+    launcher, _, arguments = line.partition("-m method_configs.train ")
+    assert parser().parse_args(shlex.split(arguments)).preset in PRESETS
+    if launcher.startswith("torchrun"):
+        from torch.distributed.run import get_args_parser
+
+        get_args_parser().parse_args([*shlex.split(launcher)[1:], "script"])
 
 
 @pytest.mark.parametrize(("page", "line"), [one for one in ALL if one[1].startswith("ns-")])

@@ -79,6 +79,11 @@ def test_only_the_first_process_writes_and_the_files_are_those_of_one(folder):
     assert all(type(value) is torch.Tensor for value in two["network"].values())
 
 
+def test_sheets_of_sharded_weights_get_whole_ones(folder):
+    sheets = {path.name: path.read_text() for path in (folder / "sharded" / "sheets").iterdir()}
+    assert sheets == dict.fromkeys(("000005.png", "000010.png", "000015.png", "000020.png"), "torch.Size([128, 16])")
+
+
 def test_a_signal_to_one_process_stops_both_with_a_checkpoint(folder):
     told = [json.loads((folder / f"told-{rank}.json").read_text()) for rank in range(2)]
     assert [one["step"] for one in told] == [3, 3] and [one["signal"] for one in told] == [15, 15]

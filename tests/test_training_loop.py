@@ -5,19 +5,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import inspect
 import json
 import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from tiny_training import LOOP, TOY, TinyStage, losses_of, run_in
 
+from fb_core.networks.dit import DiT
+from fb_core.training import dry_run
 from fb_core.training.distributed import ALONE
 from fb_core.training.loop import EngineConfig, LoopConfig, Run, Stage
+from fb_core.training.recipe import make_sheet, make_stage
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = dataclasses.replace(LOOP, steps=6, save_every=2)
@@ -237,3 +242,55 @@ train.main(["toy", "--output", {str(tmp_path)!r}, "--device", "cpu", "--sheet-ev
     assert "no loss.png, because matplotlib is not installed" in done.stderr and "no 000002.png" in done.stderr
     assert "no TensorBoard files" in done.stderr and "dit: step 4 of 4" in done.stderr
     assert json.loads((tmp_path / "model" / "config.json").read_text())["info"]["preset"] == "toy"
+
+
+def test_the_entrance_without_tyro_has_the_options_of_the_command():
+    from method_configs.commands import train as command
+    from method_configs.train import parser
+    from method_configs.training_command import train_preset
+
+    expected, real = (inspect.signature(function).parameters for function in (command, train_preset))
+    assert {name: one.default for name, one in expected.items()} == {name: one.default for name, one in real.items()}
+    parsed = parser().parse_args(["toy", "--output", "there", "--steps", "3", "--minutes", "0.5", "--no-half", "--dry-run"])
+    assert vars(parsed).keys() == real.keys()
+    assert (parsed.output, parsed.steps, parsed.minutes, parsed.half, parsed.dry_run, parsed.shard) == (
+        Path("there"),
+        3,
+        0.5,
+        False,
+        True,
+        False,
+    )
+
+
+def test_a_dry_run_tells_what_a_stage_costs_and_writes_nothing(tmp_path, monkeypatch, caplog):
+    from method_configs import ablations, training_command
+
+    monkeypatch.setitem(ablations.PRESETS, "toy", TOY)
+    monkeypatch.setattr(training_command, "measure", partial(dry_run.measure, seconds=0.1))
+    with caplog.at_level("INFO"):
+        assert training_command.train_preset("toy", tmp_path / "new", device="cpu", stage="dit", dry_run=True) is None
+    assert "dit: parameters network" in caplog.text and "steps per second" in caplog.text
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_cost_of_a_stage_counts_what_can_be_counted_by_hand():
+    cost = dry_run.measure(TOY, "dit", device=torch.device("cpu"), engine=EngineConfig(), seconds=0.1)
+    network = DiT(TOY.dit)
+    count = sum(parameter.numel() for parameter in network.parameters())
+    assert cost.parameters["network"] == count and set(cost.parameters) == {"network", "image_vae", "raymap_vae"}
+    assert cost.weight_bytes == 4 * (2 * count + cost.parameters["image_vae"] + cost.parameters["raymap_vae"])
+    assert cost.step_bytes >= 4 * 3 * count  # gradients and two moments, beside activations
+    tokens = TOY.dit_loss.batch * TOY.dit_loss.task.views
+    in_blocks = sum(p.numel() for name, p in network.named_parameters() if p.ndim == 2 and ("attn" in name or "ff" in name))
+    assert cost.flops > 6 * in_blocks * tokens and cost.steps_per_second > 0 and 0 < cost.data_share < 1 and cost.utilisation > 0
+
+
+@pytest.mark.parametrize("stage", ["image-vae", "raymap-vae", "dit"])
+def test_sheets_show_an_unseen_room(tmp_path, stage):
+    from PIL import Image
+
+    task, _ = make_stage(TOY, stage, None)
+    make_sheet(TOY, task)(tmp_path / "000003.png", task.network.state_dict())
+    width, height = Image.open(tmp_path / "000003.png").size
+    assert width > 300 and height > 200 and task.network.training

@@ -74,7 +74,10 @@ def losses_of(folder: Path) -> list[float]:
 
 
 def run_in(folder: Path, group: Group, *, bad: tuple[int, int] | None = None, **engine: bool | int) -> Run:
-    return Run(TinyStage(bad), LOOP, folder, preset="tiny", engine=EngineConfig(**engine), group=group)  # type: ignore[arg-type]
+    def sheet(path: Path, state: dict[str, torch.Tensor]) -> None:
+        path.write_text(f"{state['proj_out_2.weight'].shape}")
+
+    return Run(TinyStage(bad), LOOP, folder, preset="tiny", engine=EngineConfig(**engine), group=group, on_sheet=sheet)  # type: ignore[arg-type]
 
 
 def _child(folder: Path) -> None:
@@ -82,7 +85,11 @@ def _child(folder: Path) -> None:
     torch.set_num_threads(1)
     sys.modules["matplotlib"] = None  # type: ignore[assignment]  # no curves: importing it takes longer than the training
     with joined(torch.device("cpu")) as (group, _):
-        for name, engine in {"two": {}, "parts": {"accumulate": 2}, "sharded": {"shard": True, "accumulate": 2, "recompute": True}}.items():
+        for name, engine in {
+            "two": {},
+            "parts": {"accumulate": 2},
+            "sharded": {"shard": True, "accumulate": 2, "recompute": True, "sheet_every": 5},
+        }.items():
             run_in(folder / name, group, **engine).train(at_most=9)
             resumed = run_in(folder / name, group, **engine)
             resumed.train()

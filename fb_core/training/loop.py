@@ -290,6 +290,8 @@ class Run:
             drawn = self._ahead[1].result()
         else:
             drawn = self._draw_place(place)
+            if torch.cuda.is_initialized():
+                torch.cuda.synchronize()  # so that rendering on the GPU counts as data's time, not as the network's
         if self.engine.draw_ahead and place + 1 < self.config.steps * len(self.parts):
             self._ahead = place + 1, ahead.submit(self._draw_place, place + 1)
         self.waited += time.monotonic() - began
@@ -334,10 +336,8 @@ class Run:
 
     def _draw_sheet(self) -> None:
         """All processes come here, as the average may be spread over them; one draws."""
-        if self._on_sheet is None or self.folder is None:
-            return
         state = self.averaged_state()
-        if self.group.is_main:
+        if self.group.is_main and self._on_sheet is not None and self.folder is not None:
             path = self.folder / "sheets" / f"{self.step:06d}.png"
             path.parent.mkdir(exist_ok=True)
             self._on_sheet(path, state)
