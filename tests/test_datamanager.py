@@ -23,9 +23,10 @@ from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 from fb_nerfstudio import datamanager
 from fb_nerfstudio.completed_views import CompletedViews, Origin
-from fb_nerfstudio.completion_config import CompletionConfig
+from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
+from fb_nerfstudio.completion_plan import plan_completion
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
-from fb_nerfstudio.unseen import Rendered, find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
+from fb_nerfstudio.unseen import Rendered, find_unseen, surface_points, unseen_gaussians, with_matched_colors, with_unseen_masks
 
 
 class GreyFiller:
@@ -344,6 +345,26 @@ def test_trained_splats_tell_where_the_holes_are(tiny_capture: Path):
     attrs = generated(manager, step=200)
     assert len(attrs.pipeline.model.modes) == 6 + 6  # captured views for the surface, generated views for the holes
     assert 0 < len(attrs.pipeline.model.added[0][0]) <= 50
+
+
+def test_no_camera_is_placed_near_to_what_the_splats_show(tiny_capture: Path, monkeypatch):
+    """The collision rule knows the depth of the current splats: the capture brings no points here, and none are triangulated."""
+    shown = ToySplats.get_outputs_for_camera
+    near = {"depth": torch.full((32, 48, 1), 0.25), "accumulation": torch.ones(32, 48, 1)}  # something stands in front of each camera
+    monkeypatch.setattr(ToySplats, "get_outputs_for_camera", lambda self, one: shown(self, one) | (near if int(one.width) == 48 else {}))
+    config = options(at_step=200, anchor_views=12, placement=PlacementConfig(clearance=1.0))
+    manager = make(tiny_capture, config, points=False, start_points=0)
+    generated(manager, step=200)
+    cameras = manager._captured_cameras()
+    points = surface_points(ToySplats(), cameras)
+    clearance = float(plan_completion(cameras, points, config, size=16).shell.log_radius.median().exp())
+
+    def too_near(centers: torch.Tensor) -> torch.Tensor:
+        home = torch.cdist(centers, torch.cat([camera.centers for camera in cameras])).min(dim=1).values
+        return (torch.cdist(centers, points).min(dim=1).values < 0.9 * clearance) & (home > 1e-3)  # points are thinned for the rule
+
+    blind = torch.cat([one.cameras.centers for one in plan_completion(cameras, None, config, size=16).rounds])
+    assert bool(too_near(blind).any()) and not bool(too_near(manager.generated_views.cameras.centers).any())
 
 
 def test_no_gaussians_are_added_when_not_wanted(tiny_capture: Path):

@@ -105,6 +105,17 @@ def test_defaults_that_users_rely_on() -> None:
     assert (model.normal_alignment, model.normal_alignment_weight, model.ssim_lambda) == ("squared", 0.01, 0.2)
 
 
+@pytest.mark.parametrize(("on_gpu", "steps", "cap"), [(True, 30000, 1_000_000), (False, 3000, 20000)])
+def test_the_practical_preset(monkeypatch: pytest.MonkeyPatch, on_gpu: bool, steps: int, cap: int) -> None:
+    """Points of the capture, or triangulated ones, and more where generated views show what nobody saw; SSIM, harmonics, a cap."""
+    monkeypatch.setattr(splats, "_ON_GPU", on_gpu)
+    model, datamanager = splats._model(), fillerbuster.config.pipeline.datamanager
+    assert datamanager.dataparser.load_3D_points and datamanager.start_points == 5000 and not model.random_init
+    assert datamanager.completion.seed_gaussians and datamanager.completion.max_seed_gaussians == 20000
+    assert model.ssim_lambda == 0.2 and model.sh_degree == (3 if on_gpu else 1) and model.max_gaussians == cap
+    assert model.normal_loss_from == (10000 if on_gpu else model.stop_split_at) and steps / 3 <= model.normal_loss_from < steps
+
+
 def test_the_command_line_reaches_our_options() -> None:
     arguments = ["--max-num-iterations", "5", "--pipeline.model.max-gaussians", "100", "--pipeline.datamanager.completion.enabled", "False"]
     arguments += ["--pipeline.model.normal-alignment", "absolute", "--optimizers.means.optimizer.fused", "False"]

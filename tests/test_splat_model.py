@@ -16,10 +16,12 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.normals import normals_of_picture
 from fb_nerfstudio.bridge import to_nerfstudio
 from fb_nerfstudio.fused_adam import FusedAdamOptimizerConfig
 from fb_nerfstudio.gaussians import evenly_chosen, gaussians_at, neighbour_distance
 from fb_nerfstudio.lazy_lpips import LazyLpips
+from fb_nerfstudio.normal_losses import alignment_loss, total_variation
 from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
 from fb_nerfstudio.splat_model import FillerbusterSplatModel, FillerbusterSplatModelConfig
 
@@ -308,6 +310,21 @@ def test_normals_are_rendered_only_when_a_loss_needs_them() -> None:
     assert {"normal_alignment", "normal_tv"} <= set(model.get_loss_dict(outputs, make_batch()))
     model.config.normal_alignment_weight = model.config.normal_tv_weight = 0.0
     assert "normal" not in model(camera())
+
+
+def test_normal_losses_begin_at_their_step_with_the_papers_weights() -> None:
+    """lambda_align is 0.01 (appendix of the paper); before the step neither loss is there, and from it on they are weight times term."""
+    model = make_model(normal_loss_from=5).train()
+    optimizers, batch = make_optimizers(model), make_batch()
+    for step, begins in ((4, False), (5, True), (6, True)):
+        model.step_cb(optimizers, step)
+        outputs = model(camera())
+        losses = model.get_loss_dict(outputs, batch)
+        assert ("normal_alignment" in losses, "normal_tv" in losses) == (begins, begins), step
+    rendered, surface = (normals_of_picture(outputs[name]) for name in ("normal", "surface_normal"))
+    assert float(losses["normal_alignment"]) == pytest.approx(0.01 * float(alignment_loss(rendered, surface)))
+    assert float(losses["normal_tv"]) == pytest.approx(0.001 * float(total_variation(outputs["normal"])))
+    assert float(losses["normal_alignment"]) > 0 and float(losses["normal_tv"]) > 0
 
 
 def test_normal_losses_train_without_nan() -> None:
