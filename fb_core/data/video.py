@@ -185,7 +185,7 @@ def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray,
             continue
         if display is None:
             display, start = Display.of(frame, pixel_aspect), frame.time
-            if frame.color_trc in _HDR:
+            if getattr(frame, "color_trc", None) in _HDR:  # older releases of PyAV do not tell
                 _logger.warning("film %s has HDR colours, which are used as they are: pale; export it as SDR for better ones", path)
         group += frame.key_frame
         frames.append(FilmFrame(number=len(frames), pts=frame.pts, seconds=frame.time - start, group=group))
