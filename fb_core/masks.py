@@ -18,18 +18,30 @@ def rotated_rectangle(height: int, width: int, *, center: tuple[float, float], s
     return ((along.abs() <= size[1] / 2) & (across.abs() <= size[0] / 2)).float()
 
 
-def partly_known(height: int, width: int, *, generator: torch.Generator) -> Float[Tensor, "1 h w"]:
-    """A mask with 2 to 10 unknown rotated rectangles of 10 to 50 % of the image's side (paper, "Masking out regions")."""
-    known = torch.ones(height, width)
-    for _ in range(int(torch.randint(2, 11, (), generator=generator))):
-        size_y, size_x, y, x, turn = torch.rand(5, generator=generator).tolist()
-        size = ((0.1 + 0.4 * size_y) * height, (0.1 + 0.4 * size_x) * width)
-        known *= 1 - rotated_rectangle(height, width, center=(y * height, x * width), size=size, angle_radians=2 * math.pi * turn)
-    return known[None]
+def partly_known(height: int, width: int, *, generator: torch.Generator, device: torch.device | str = "cpu") -> Float[Tensor, "1 h w"]:
+    """A mask with 2 to 10 unknown rotated rectangles of 10 to 50 % of the image's side (paper, "Masking out regions").
+
+    The draws are those of the generator, on the CPU; the mask is made on the device, all rectangles at once.
+    """
+    draws = [torch.rand(5, generator=generator) for _ in range(int(torch.randint(2, 11, (), generator=generator)))]
+    size_y, size_x, y, x, turn = torch.stack(draws).double().to(device)[..., None, None].unbind(1)
+    down, along_row = ((torch.arange(side, device=device) + 0.5).double() for side in (height, width))
+    down, right = down[:, None] - y * height, along_row - x * width
+    cosine, sine = torch.cos(2 * math.pi * turn), torch.sin(2 * math.pi * turn)
+    in_width = (right * cosine + down * sine).abs() <= (0.1 + 0.4 * size_x) * width / 2
+    in_height = (down * cosine - right * sine).abs() <= (0.1 + 0.4 * size_y) * height / 2
+    return 1 - (in_width & in_height).any(dim=0, keepdim=True).float()
 
 
 def training_mixture(
-    count: int, height: int, width: int, *, generator: torch.Generator, known: int | None = None, unknown: int | None = None
+    count: int,
+    height: int,
+    width: int,
+    *,
+    generator: torch.Generator,
+    known: int | None = None,
+    unknown: int | None = None,
+    device: torch.device | str = "cpu",
 ) -> Float[Tensor, "n 1 h w"]:
     """Masks of one training sequence: by default a quarter of the views known, half unknown, the rest partly known, in random order.
 
@@ -39,11 +51,11 @@ def training_mixture(
     unknown = count // 2 if unknown is None else unknown
     if known + unknown > count:
         raise ValueError(f"training mixture: {known} known and {unknown} unknown views do not fit into {count} views")
-    masks = torch.zeros(count, 1, height, width)
+    masks = torch.zeros(count, 1, height, width, device=device)
     order = torch.randperm(count, generator=generator)
     masks[order[:known]] = 1.0
     for view in order[known + unknown :].tolist():
-        masks[view] = partly_known(height, width, generator=generator)
+        masks[view] = partly_known(height, width, generator=generator, device=device)
     return masks
 
 

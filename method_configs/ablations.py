@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from fb_core.data.sequences import PoolConfig, TaskConfig
+import dataclasses
+from typing import Any
+
+from fb_core.data.sequences import PoolConfig
+from fb_core.data.training_data import Resolution
+from fb_core.data.training_task import TaskConfig
 from fb_core.networks.dit import DiTConfig
-from fb_core.networks.vae import VAEConfig
+from fb_core.networks.vae import IMAGE_VAE, RAYMAP_VAE, VAEConfig
 from fb_core.sampler import SamplingConfig
 from fb_core.training.dit_stage import DiTLossConfig
-from fb_core.training.loop import LoopConfig
+from fb_core.training.loop import EngineConfig, LoopConfig
 from fb_core.training.recipe import Recipe
 from fb_core.training.vae_stage import VAELossConfig
+
+_NARROW_TO_WIDE = ("narrow", "medium", "wide")
 
 ROOMS_TINY = Recipe(
     name="rooms-tiny",
@@ -31,4 +38,125 @@ ROOMS_TINY = Recipe(
 )
 """The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about two and a half hours."""
 
-PRESETS: dict[str, Recipe] = {recipe.name: recipe for recipe in (ROOMS_TINY,)}
+ROOMS = Recipe(
+    name="rooms",
+    image_vae=VAEConfig(widths=(32, 64, 128, 128), encoder_resnets=1, decoder_resnets=1, norm="none"),
+    raymap_vae=VAEConfig(in_channels=6, widths=(16, 32, 32, 32), encoder_resnets=1, decoder_resnets=1, norm="none", padding="replicate"),
+    dit=DiTConfig(heads=6, head_dim=64, depth=6, text_width=0),
+    # Narrow rooms first, then medium, then wide: starting wide, a small model does not learn.
+    pool=PoolConfig(families=("narrow", "medium", "wide"), family_rooms=2000, rooms=600, views=24, image_size=128, renewed_per_step=0.25),
+    vae_pool=PoolConfig(
+        families=("narrow", "medium", "wide"), family_rooms=400, rooms=300, views=24, image_size=128, renewed_per_step=0.25
+    ),
+    image_vae_loop=LoopConfig(steps=4000, learning_rate=4e-4, warmup_steps=200, cooldown=0.5, average=0.99, save_every=500),
+    raymap_vae_loop=LoopConfig(steps=3000, learning_rate=1e-4, warmup_steps=200, cooldown=0.5, save_every=500),
+    dit_loop=LoopConfig(steps=30_000, learning_rate=6e-4, warmup_steps=500, average=0.999, save_every=1000),
+    image_vae_loss=VAELossConfig(batch=64),
+    raymap_vae_loss=VAELossConfig(batch=64),
+    sampling=SamplingConfig(steps=16, guidance_unknown=1.0, guidance_known=1.0),
+    dit_loss=DiTLossConfig(batch=32, task=TaskConfig(views=20, ray_task=0.15, random_heading=False, random_fill=False), ray_weight=0.3),
+    engine=EngineConfig(precision="bfloat16", draw_ahead=True),
+)
+"""Rooms at 128x128 with sequences of 20, for one large GPU: 46 MB in half precision. Sized for about 25 minutes on an H200; not run yet."""
+
+# ---- the paper's recipe: every number that it gives, and where from ----
+# "paper": the paper or its appendix. "released": what the authors' code does where the paper is silent. "ours": a choice of this project.
+
+_CONSTANT = LoopConfig(
+    steps=200_000,  # ours, of the autoencoders
+    learning_rate=1e-4,  # paper: constant at 1e-4
+    warmup_steps=1,  # paper: constant
+    cooldown=0.0,  # paper: constant
+    weight_decay=1e-2,  # released
+    betas=(0.9, 0.999),  # released
+    clip=1.0,  # released
+    average=0.9999,  # ours
+    save_every=5000,  # released
+)
+_PAPER_POOL = PoolConfig(  # ours: rooms that stand in for captures and meshes where none are named
+    families=_NARROW_TO_WIDE, family_rooms=20_000, rooms=128, views=20, image_size=256, renewed_per_step=0.1
+)  # image_size: paper, 256 x 256 for the first million steps
+
+PAPER = Recipe(
+    name="paper",
+    image_vae=IMAGE_VAE,  # paper: 128, 256, 512, 512; 84M
+    raymap_vae=RAYMAP_VAE,  # paper: 32, 64, 128, 128, no norms, replicated borders; 5M
+    dit=DiTConfig(),  # paper: DiT-L/2, 24 layers, width 1024, text by cross-attention; 650M
+    pool=_PAPER_POOL,
+    vae_pool=_PAPER_POOL,
+    image_vae_loop=_CONSTANT,
+    raymap_vae_loop=_CONSTANT,
+    dit_loop=dataclasses.replace(_CONSTANT, steps=1_100_000),  # paper: 1M, then 100K with varying resolution
+    image_vae_loss=VAELossConfig(
+        batch=64,  # ours
+        l1=1.0,  # paper
+        kl=1e-6,  # paper
+        adversarial=0.5,  # paper
+        adversarial_from=10_000,  # released
+        perceptual=0.1,  # released; only where the weights of LPIPS are at hand
+    ),
+    raymap_vae_loss=VAELossConfig(
+        batch=64,  # ours
+        l1=1.0,  # paper
+        kl=1e-6,  # paper
+        adversarial=0.5,  # paper
+        adversarial_from=10_000,  # released
+        frame="random",  # released: any rotation and centre
+    ),
+    dit_loss=DiTLossConfig(
+        batch=256,  # paper: 4 sequences on each of 64 GPUs
+        images_per_row=13,  # paper: 52 single images instead of 4 sequences
+        ray_weight=1.0,  # released
+        task=TaskConfig(
+            views=10,  # paper
+            mixture="quarters",  # paper (section 4.4) and released
+            ray_task=0.25,  # paper
+            dropout=0.1,  # paper: 10 % in all, equally images, raymaps, both
+            frame="upright",  # paper
+            random_heading=True,  # paper
+            random_fill=True,  # paper
+        ),
+    ),
+    single_view_share=0.5,  # paper
+    resolutions=(  # paper: image sizes and views; ours: how many sequences and pictures fill a row
+        Resolution(image_size=64, views=20, sequences=8, images=200),
+        Resolution(image_size=128, views=20, sequences=2, images=52),
+        Resolution(image_size=256, views=10, sequences=1, images=13),
+        Resolution(image_size=512, views=5, sequences=1, images=3),
+        Resolution(image_size=1024, views=2, sequences=1, images=1),
+    ),
+    resolutions_from=1_000_000,  # paper
+    engine=EngineConfig(precision="bfloat16", draw_ahead=True),  # paper: bfloat16
+)
+"""The paper's training at its full size: 64 GPUs for a month. On fewer, ``--accumulate`` keeps the batch."""
+
+PAPER_SHORT = dataclasses.replace(
+    PAPER,
+    name="paper-short",
+    dit_loop=dataclasses.replace(_CONSTANT, steps=100_000),
+    dit_loss=dataclasses.replace(PAPER.dit_loss, task=dataclasses.replace(PAPER.dit_loss.task, views=8)),
+    resolutions=(),
+    resolutions_from=0,
+)
+"""What the paper's ablations start from: 100K steps with sequences of 8 (section 4.4)."""
+
+
+def ablations_of(base: Recipe) -> tuple[Recipe, ...]:
+    """The four ablations of the paper's table 2, each one field away from ``base``."""
+
+    def named(name: str, **changes: Any) -> Recipe:
+        return dataclasses.replace(base, name=f"{base.name}-{name}", **changes)
+
+    task = dataclasses.replace(base.dit_loss.task, frame="random")
+    return (
+        named("no-index-emb", dit=dataclasses.replace(base.dit, index="none")),  # raymaps alone tell views apart
+        named("fixed-index-emb", dit=dataclasses.replace(base.dit, index="fixed")),  # trained on the same few positions always
+        named("no-poses", dit_loss=dataclasses.replace(base.dit_loss, ray_weight=0.0)),  # raymaps are not denoised
+        named("random-poses", dit_loss=dataclasses.replace(base.dit_loss, task=task)),  # no camera at the origin and upright
+    )
+
+
+PRESETS: dict[str, Recipe] = {
+    recipe.name: recipe for recipe in (ROOMS_TINY, ROOMS, PAPER, PAPER_SHORT, *ablations_of(ROOMS_TINY), *ablations_of(PAPER_SHORT))
+}
+"""``fillerbuster train PRESET``."""

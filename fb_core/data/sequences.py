@@ -145,14 +145,14 @@ class ViewPool(ABC):
     def _sequence(self, task: TaskConfig, slots: range, generator: torch.Generator) -> dict[str, Tensor]:
         framed = self._frame(task, slots, generator)
         slot, chosen = framed.slot, framed.chosen
-        image_known, rays_known = draw_task(len(chosen), self.image_size, task, generator=generator)
+        image_known, rays_known = draw_task(len(chosen), self.image_size, task, generator=generator, device=self.device)
         latents = self._latents[slot]
         kept = {} if latents is None else {"image_latents": latents[chosen]}
         return kept | {
             "images": self._images[slot, chosen].float() / 255,
             "raymaps": framed.raymaps(),
-            "image_known": image_known.to(self.device),
-            "rays_known": rays_known.to(self.device),
+            "image_known": image_known,
+            "rays_known": rays_known,
         }
 
 

@@ -130,14 +130,17 @@ def _random_frame(cameras: Pinholes, fill: float, generator: torch.Generator) ->
     return CanonicalFrame(rotation=rotation.to(cameras.centers), center=center.to(cameras.centers), scale=rounded)
 
 
-def draw_task(count: int, size: int, task: TaskConfig, *, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def draw_task(
+    count: int, size: int, task: TaskConfig, *, generator: torch.Generator, device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor]:
     """(image mask, ray mask), each [n, 1, size, size]: one modality is to be completed, the other is known, or dropped.
 
     With mixture "shares" the first view, the frame's reference, is known or partly known, as in inference.
     """
-    masks = (
-        training_mixture(count, size, size, generator=generator) if task.mixture == "quarters" else _by_shares(count, size, task, generator)
-    )
+    if task.mixture == "quarters":
+        masks = training_mixture(count, size, size, generator=generator, device=device)
+    else:
+        masks = _by_shares(count, size, task, generator, device)
     everything = torch.ones_like(masks)
     is_ray_task = float(torch.rand((), generator=generator)) < task.ray_task
     image_known, rays_known = (everything, masks) if is_ray_task else (masks, everything)
@@ -145,13 +148,15 @@ def draw_task(count: int, size: int, task: TaskConfig, *, generator: torch.Gener
     return image_known * (not drop_images), rays_known * (not drop_rays)
 
 
-def _by_shares(count: int, size: int, task: TaskConfig, generator: torch.Generator) -> Float[Tensor, "n 1 size size"]:
+def _by_shares(
+    count: int, size: int, task: TaskConfig, generator: torch.Generator, device: torch.device | str
+) -> Float[Tensor, "n 1 size size"]:
     low, high = task.known_share
     share = low + (high - low) * float(torch.rand((), generator=generator))
     known = min(count, max(1, round(share * count)))
-    masks = torch.zeros(count, 1, size, size)
+    masks = torch.zeros(count, 1, size, size, device=device)
     masks[:known] = 1.0
     partial = torch.rand(count, generator=generator) < task.partial_share
     for view in partial.nonzero()[:, 0].tolist():
-        masks[view] = partly_known(size, size, generator=generator)
+        masks[view] = partly_known(size, size, generator=generator, device=device)
     return masks

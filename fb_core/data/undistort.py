@@ -47,12 +47,31 @@ def undistort(
         return image, mask, camera
     import cv2
 
-    straight, to_bent = (_fisheye_map if camera_model in FISHEYE_MODELS else _perspective_map)(camera, distortion)
+    straight = straight_camera(camera, camera_model, distortion)
+    to_bent = (_fisheye_map if camera_model in FISHEYE_MODELS else _perspective_map)(camera, distortion, _matrix(straight))
     colours = torch.where(mask > 0, image, torch.zeros_like(image))  # unknown colours may be anything, NaN included
     bent = rearrange(torch.cat([colours, mask]), "c h w -> h w c").contiguous().numpy()
     result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
     result = rearrange(torch.from_numpy(result), "h w c -> c h w")
     return result[:3].contiguous(), (result[3:] > 1 - 1e-4).to(mask.dtype), straight
+
+
+def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, float]) -> Pinholes:
+    """The camera that :func:`undistort` gives, without a picture."""
+    check_lens(camera_model, distortion, "straight_camera")
+    if not any(distortion.values()):
+        return camera
+    import cv2
+
+    size = (camera.width, camera.height)
+    if camera_model in FISHEYE_MODELS:
+        lens = _fisheye_lens(distortion)
+        matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(_matrix(camera), lens, size, np.eye(3), balance=0)
+    else:
+        matrix, _ = cv2.getOptimalNewCameraMatrix(_matrix(camera), _perspective_lens(distortion), size, 0)
+    values = torch.from_numpy(np.asarray(matrix, dtype=np.float64))
+    focal, principal = torch.stack([values[0, 0], values[1, 1]])[None], values[None, :2, 2] + 0.5
+    return dataclasses.replace(camera, focal=focal.to(camera.focal), principal=principal.to(camera.principal))
 
 
 def _matrix(camera: Pinholes) -> np.ndarray:
@@ -62,34 +81,30 @@ def _matrix(camera: Pinholes) -> np.ndarray:
     return matrix
 
 
-def _with_matrix(camera: Pinholes, matrix: np.ndarray) -> Pinholes:
-    values = torch.from_numpy(np.asarray(matrix, dtype=np.float64))
-    focal, principal = torch.stack([values[0, 0], values[1, 1]])[None], values[None, :2, 2] + 0.5
-    return dataclasses.replace(camera, focal=focal.to(camera.focal), principal=principal.to(camera.principal))
+def _perspective_lens(distortion: dict[str, float]) -> np.ndarray:
+    """Brown's model, in OpenCV's order."""
+    return np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
 
 
-def _perspective_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pinholes, tuple[np.ndarray, np.ndarray]]:
-    """Brown's model: the pinhole camera, and for each of its pixels the place in the bent picture."""
+def _fisheye_lens(distortion: dict[str, float]) -> np.ndarray:
+    """The equidistant model with four coefficients."""
+    return np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
+
+
+def _perspective_map(camera: Pinholes, distortion: dict[str, float], straight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each pixel of the pinhole camera the place in the bent picture."""
     import cv2
 
-    coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
     size = (camera.width, camera.height)
-    matrix = _matrix(camera)
-    straight, _ = cv2.getOptimalNewCameraMatrix(matrix, coefficients, size, 0)
-    maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), straight, size, cv2.CV_32FC1)
-    return _with_matrix(camera, straight), maps
+    return cv2.initUndistortRectifyMap(_matrix(camera), _perspective_lens(distortion), np.eye(3), straight, size, cv2.CV_32FC1)
 
 
-def _fisheye_map(camera: Pinholes, distortion: dict[str, float]) -> tuple[Pinholes, tuple[np.ndarray, np.ndarray]]:
-    """The equidistant model with four coefficients; otherwise like :func:`_perspective_map`."""
+def _fisheye_map(camera: Pinholes, distortion: dict[str, float], straight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Like :func:`_perspective_map`."""
     import cv2
 
-    coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
     size = (camera.width, camera.height)
-    matrix = _matrix(camera)
-    straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(matrix, coefficients, size, np.eye(3), balance=0)
-    maps = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), straight, size, cv2.CV_32FC1)
-    return _with_matrix(camera, straight), maps
+    return cv2.fisheye.initUndistortRectifyMap(_matrix(camera), _fisheye_lens(distortion), np.eye(3), straight, size, cv2.CV_32FC1)
 
 
 def straight_directions(
@@ -106,10 +121,8 @@ def straight_directions(
         return points.new_zeros(0, 3)
     bent = (points.double() - 0.5).numpy()[:, None]
     if camera_model in FISHEYE_MODELS:
-        coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
-        plane = cv2.fisheye.undistortPoints(bent, _matrix(camera), coefficients)
+        plane = cv2.fisheye.undistortPoints(bent, _matrix(camera), _fisheye_lens(distortion))
     else:
-        coefficients = np.array([distortion.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
-        plane = cv2.undistortPoints(bent, _matrix(camera), coefficients)
+        plane = cv2.undistortPoints(bent, _matrix(camera), _perspective_lens(distortion))
     directions = torch.nn.functional.pad(torch.from_numpy(plane.reshape(-1, 2)), (0, 1), value=1.0)
     return torch.nn.functional.normalize(directions, dim=-1).to(points.dtype)

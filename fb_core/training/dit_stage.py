@@ -34,7 +34,9 @@ class DiTLossConfig:
     task: TaskConfig = TaskConfig()
     """Views, masks, and which modality is completed."""
     ray_weight: float = 1.0
-    """Weight of the raymap channels' loss (paper: 1)."""
+    """Weight of the raymap channels' loss (paper: 1; its ablation "no-poses": 0)."""
+    images_per_row: int = 1
+    """Captioned single pictures that stand for one sequence."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,20 +8,25 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
 
 from fb_core import checkpoint
 from fb_core.conditioning import encode_in_chunks
-from fb_core.data.sequences import PoolConfig, RoomPool
+from fb_core.data.sequences import PoolConfig
+from fb_core.data.training_data import Resolution, TrainingData, at_resolution, multi_view_source, resolution_of, training_source
+from fb_core.data.training_task import Source
 from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.sampler import SamplingConfig
 from fb_core.training.distributed import ALONE, Group
-from fb_core.training.dit_stage import DiTLossConfig, DiTStage
+from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText
 from fb_core.training.linear_start import start_linear
 from fb_core.training.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
+from fb_core.training.perceptual import load_lpips
 from fb_core.training.sample_sheets import reconstruction_sheet, room_sheet
 from fb_core.training.vae_stage import VAELossConfig, VAEStage, reconstruction_error
 
@@ -59,6 +64,14 @@ class Recipe:
     """Loss and task of the transformer."""
     sampling: SamplingConfig = SamplingConfig()
     """How the finished model samples best; its folder says so."""
+    single_view_share: float = 0.0
+    """Share of the steps that show captioned single pictures (paper: 0.5), where such data are named."""
+    resolutions: tuple[Resolution, ...] = ()
+    """Image sizes of the transformer's last steps, one of which each process is assigned; none = one size throughout."""
+    resolutions_from: int = 0
+    """Step at which they begin."""
+    data: TrainingData = TrainingData()
+    """Where the data lie; rooms by default."""
     engine: EngineConfig = EngineConfig()
     """How a machine trains it, unless the command says otherwise."""
     seed: int = 0
@@ -83,10 +96,10 @@ def run_stage(
 
     Raises ValueError for an unknown stage, and for a transformer whose autoencoders are not there yet.
     """
-    task, loop = make_stage(recipe, stage, folder, device=device)
+    task, loop = make_stage(recipe, stage, folder, device=device, rank=group.rank)
     loop = loop if steps is None else dataclasses.replace(loop, steps=steps)
     engine = engine or recipe.engine
-    on_sheet = make_sheet(recipe, task) if engine.sheet_every and group.is_main else None
+    on_sheet = make_sheet(recipe, task) if engine.sheet_every else None
     run = Run(task, loop, folder / stage, preset=recipe.name, engine=engine, group=group, on_sheet=on_sheet)
     run.train(on_progress=on_progress if group.is_main else None, minutes=minutes)
     if isinstance(task, VAEStage) and not run.signal:
@@ -99,9 +112,12 @@ def run_stage(
 
 
 def make_stage(
-    recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu"
+    recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu", rank: int = 0
 ) -> tuple[VAEStage | DiTStage, LoopConfig]:
-    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born."""
+    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born.
+
+    ``rank`` is this process's number, which decides its resolution where the recipe has several.
+    """
     if stage not in STAGES:
         raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")
     if stage != "dit":
@@ -109,10 +125,49 @@ def make_stage(
     image_vae, raymap_vae = (
         _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device) for kind in STAGES[:2]
     )
-    pool = RoomPool(recipe.pool, seed=recipe.seed + 1, device=device, encode=lambda images: encode_in_chunks(image_vae, images, 64))
     network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device)
-    task = DiTStage(network, image_vae=image_vae, raymap_vae=raymap_vae, pool=pool, config=recipe.dit_loss, seed=recipe.seed)
+    task = DiTStage(
+        network,
+        image_vae=image_vae,
+        raymap_vae=raymap_vae,
+        pool=_sequences(recipe, image_vae, device, rank),
+        config=recipe.dit_loss,
+        seed=recipe.seed,
+        encode_text=_encode_text(recipe, device, stands_in=folder is None) if recipe.dit.text_width else None,
+    )
     return task, recipe.dit_loop
+
+
+def _sequences(recipe: Recipe, image_vae: VAE, device: torch.device | str, rank: int) -> Source:
+    """The transformer's data: at one size, and at this process's own from some step on."""
+    shared: dict[str, Any] = {
+        "seed": recipe.seed + 1,
+        "device": device,
+        "single_share": recipe.single_view_share,
+        "encode": lambda images: encode_in_chunks(image_vae, images, 64),
+    }
+    source = training_source(recipe.data, recipe.pool, per_row=recipe.dit_loss.images_per_row, **shared)
+    if not recipe.resolutions:
+        return source
+    mine = resolution_of(recipe.resolutions, seed=recipe.seed, rank=rank)
+    _logger.info("process %d: %d x %d pixels from step %d on", rank, mine.image_size, mine.image_size, recipe.resolutions_from)
+    return at_resolution(source, mine, recipe.resolutions_from, recipe.data, recipe.pool, **shared)
+
+
+def _encode_text(recipe: Recipe, device: torch.device | str, *, stands_in: bool) -> EncodeText:
+    """Embeddings of captions; zeros in a trial run without the text model."""
+    if stands_in and recipe.data.text_encoder is None:
+        return lambda texts: torch.zeros(len(texts), WORDS, recipe.dit.text_width or 0, device=device)
+    return _text_encoder(recipe, device).encode
+
+
+def _text_encoder(recipe: Recipe, device: torch.device | str) -> TextEncoder:
+    if recipe.data.text_encoder is None:
+        raise ValueError(
+            f"preset {recipe.name!r} reads text: give a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), "
+            "or choose a preset without text"
+        )
+    return TextEncoder.from_folder(recipe.data.text_encoder, device=device)
 
 
 def make_sheet(recipe: Recipe, task: VAEStage | DiTStage) -> OnSheet:
@@ -133,8 +188,17 @@ def _vae_stage(recipe: Recipe, kind: str, device: torch.device | str) -> tuple[V
         "image-vae": (recipe.image_vae_loss, recipe.image_vae_loop),
         "raymap-vae": (recipe.raymap_vae_loss, recipe.raymap_vae_loop),
     }[kind]
-    pool = RoomPool(recipe.vae_pool, seed=recipe.seed + 1, device=device, with_images=kind == "image-vae")
-    return VAEStage(_new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed), loop
+    shared: dict[str, Any] = {"seed": recipe.seed + 1, "device": device}
+    perceptual = None
+    if kind == "image-vae":  # learns from all data; raymaps come from multi-view data alone (paper)
+        pool = training_source(recipe.data, recipe.vae_pool, single_share=recipe.single_view_share, per_row=1, **shared)
+        if loss.perceptual and recipe.data.lpips is not None:
+            perceptual = load_lpips(recipe.data.lpips).to(device)
+        elif loss.perceptual:
+            _logger.warning("the perceptual loss is left out: no file with the weights of LPIPS's backbone was named")
+    else:
+        pool = multi_view_source(recipe.data, recipe.vae_pool, with_images=False, **shared)
+    return VAEStage(_new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed, perceptual=perceptual), loop
 
 
 def _new_vae(recipe: Recipe, kind: str) -> VAE:
@@ -188,7 +252,9 @@ def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = t
         "sampling": _differences(recipe.sampling),
         "training": records,
     }
-    checkpoint.save(output, dit=dit, image_vae=vaes["image-vae"], raymap_vae=vaes["raymap-vae"], info=info, dtype=dtype)
+    prompt = _text_encoder(recipe, "cpu").encode([""])[0] if recipe.dit.text_width else None
+    networks = {"dit": dit, "image_vae": vaes["image-vae"], "raymap_vae": vaes["raymap-vae"]}
+    checkpoint.save(output, **networks, info=info, empty_prompt=prompt, dtype=dtype)
     _logger.info("wrote the model to %s", output)
 
 

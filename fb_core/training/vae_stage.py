@@ -93,7 +93,16 @@ class VAEStage(Stage):
         return Pictures(values=values, noise=noise.to(values), step=step)
 
     def losses(self, drawn: Pictures) -> dict[str, Tensor]:
-        """The terms, and their weighted sum. The discriminator's own loss is part of the sum; neither network feels the other's."""
+        """The terms, and their weighted sum. The discriminator's own loss is part of the sum; neither network feels the other's.
+
+        The raymap autoencoder learns in float32 whatever the others do: it is always used in it.
+        """
+        if self.name == "image-vae":
+            return self._losses(drawn)
+        with torch.autocast(drawn.values.device.type, enabled=False):
+            return self._losses(drawn)
+
+    def _losses(self, drawn: Pictures) -> dict[str, Tensor]:
         config, target = self.config, drawn.values
         mean, logvar = self.network.posterior(target)
         latent = mean + (0.5 * logvar).exp() * drawn.noise
