@@ -27,6 +27,7 @@ _LEAST_SIDE = 32  # optical flow needs as much
 _NEW_REFERENCE = 0.04  # once the picture has moved by this share of its longer side, motion is measured from here on
 _MOST_STEP = 0.25  # of the longer side: what optical flow says beyond that (a cut) is not believed
 _LEAST_COMPLETE = 0.95  # share of the frames announced by the header that must be there
+_UNTAGGED = 2  # colour space "unspecified"
 _HDR = (16, 18)  # transfer curves PQ and HLG
 _CACHE_BYTES = 256 * 2**20
 _logger = logging.getLogger(__name__)
@@ -316,7 +317,8 @@ def _pixels(frame: Any, display: Display) -> np.ndarray:
     return np.ascontiguousarray(array[:: 1 if down >= 0 else -1, :: 1 if right >= 0 else -1])
 
 
-def _colour_matrix(frame: Any) -> int:
-    """How the frame's colours are coded (swscale's numbers): as its tags say, else BT.709 for HD films and BT.601 for small ones."""
-    tagged = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9, 10: 9}.get(int(frame.colorspace))
-    return tagged or (1 if min(frame.height, frame.width) >= 720 else 5)
+def _colour_matrix(frame: Any) -> str | None:
+    """How the frame's colours are coded: None = as its tags say; without tags BT.709 for HD films and BT.601 for small ones."""
+    if int(frame.colorspace) != _UNTAGGED:
+        return None
+    return "ITU709" if min(frame.height, frame.width) >= 720 else "ITU601"
