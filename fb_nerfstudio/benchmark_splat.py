@@ -245,7 +245,7 @@ def _counting() -> Iterator[dict[str, int]]:
 
     def counted(block: torch_compositing.Block, image: Tensor) -> None:
         pairs["evaluated"] += block.alpha.numel()
-        pairs["drawn"] += int(torch.count_nonzero(block.alpha))
+        pairs["drawn"] += int(torch.count_nonzero(block.weights))
         composited(block, image)
 
     torch_compositing._forward_block = counted
