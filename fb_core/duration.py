@@ -9,7 +9,7 @@ import torch
 
 from fb_core.checkpoint import ModelConfig
 from fb_core.inpainter import Fillerbuster
-from fb_core.memory import SIDE_MULTIPLE
+from fb_core.memory import GIB, SIDE_MULTIPLE
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import without_weights
 from fb_core.sampling.options import SamplingConfig
@@ -62,6 +62,12 @@ def seconds_of(
     decoded = (views if recovers_rays else views - known) * _flops(model.raymap_vae if recovers_rays else model.image_vae, size)[1]
     rate = _rate(str(device), dtype)
     return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
+
+
+def in_words(seconds: float, memory: int) -> str:
+    """What is expected, in round numbers, such as ``about 40 s, up to 0.6 GiB of memory``."""
+    takes = f"{max(1, seconds):.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    return f"about {takes}, up to {max(memory / GIB, 0.1):.1f} GiB of memory"
 
 
 @lru_cache(maxsize=8)

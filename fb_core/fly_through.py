@@ -17,7 +17,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import spread_subset, strided_subset
 from fb_core.geometry.pose_verdict import arrangement_of
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.memory import available_bytes
+from fb_core.memory import SIDE_MULTIPLE, available_bytes, uncut
 from fb_core.model_registration import Square
 from fb_core.registration import OnProgress, Registration, register
 from fb_core.views import Views
@@ -124,28 +124,28 @@ def room_beside(
 ) -> int:
     """New views of so many pixels a side that one sequence can hold beside the photos, for its length and for the memory that is free.
 
-    Raises ValueError, saying what would fit, when there is no memory for even one.
+    Where not even one fits, the answer is still 1, and `Fillerbuster.complete` says what would fit. Raises ValueError for a sequence that
+    the photos fill.
     """
     room = min(views, sequence - photos)
     if room < 1:
         raise ValueError(f"sequence: expected more than the {photos} photos that new views are conditioned on, got {sequence}")
-    free = available_bytes(model.device)
-    size = (side, side)
-    while free is not None and room > 1 and _thriftiest(model, photos + room, size, sampling, prompt, free) > free:
+    while room > 1 and not _fits(model, photos + room, side, sampling, prompt):
         room = room // 2
     return room
 
 
-def _thriftiest(model: Fillerbuster, views: int, size: tuple[int, int], sampling: SamplingConfig, prompt: str | None, free: int) -> int:
-    """Working bytes of a sequence, cut as small as need be."""
-    expected = model.estimate(views, size, sampling, prompt=prompt)
-    if expected.working <= free:
-        return expected.working
+def _fits(model: Fillerbuster, views: int, side: int, sampling: SamplingConfig, prompt: str | None) -> bool:
+    """Whether a sequence fits into the memory that is free, however its work is cut."""
+    size, free = (side, side), available_bytes(model.device)
+    if free is None or uncut(views, size, free, model=model.config, sampling=sampling, prompted=bool(prompt)) is not None:
+        return True
+    tight = dataclasses.replace(sampling, memory_budget_bytes=model.estimate(1, (SIDE_MULTIPLE, SIDE_MULTIPLE), sampling).weights + free)
     try:
-        tight = dataclasses.replace(sampling, memory_budget_bytes=expected.weights + free)
-        return model.estimate(views, size, tight, prompt=prompt).working
+        model.estimate(views, size, tight, prompt=prompt)
     except ValueError:
-        return expected.working
+        return False
+    return True
 
 
 def generate(

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from fb_core.duration import in_words
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
@@ -218,8 +219,7 @@ def expectation(sequences: Sequence[tuple[int, int]], size: int, config: Complet
         expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted) for known, generated in sequences
     ]
     seconds, most = sum(one[0] for one in each), max(one[1] for one in each)
-    takes = f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-    return f"; about {takes}, up to {max(most / 2**30, 0.1):.1f} GiB of memory"
+    return f"; {in_words(seconds, most)}"
 
 
 def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:

@@ -21,12 +21,13 @@ from fb_core.data.captures import read_capture
 from fb_core.data.photo_choice import doubtful, require_two_views
 from fb_core.data.photos import Photo, read_photos
 from fb_core.data.whole_folder import whole_folder
+from fb_core.evaluation.self_consistency import self_consistency
 from fb_core.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
 from fb_core.geometry.camera_paths import PATHS, path_cameras
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
-from method_configs.complete_options import CompleteOptions, Plan, pose_sampling
+from method_configs.complete_options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.complete_output import COMMAND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
 
@@ -40,6 +41,7 @@ _WORKING = {
     "distortion_params",
     "fisheye_crop_radius",
 }
+_CHECKED_SIDE = 512  # pixels of the longer side of photos whose cameras are looked for once more
 _logger = logging.getLogger(__name__)
 
 
@@ -142,7 +144,17 @@ def _with_known_poses(photos: list[Photo], capture: Path) -> list[Photo]:
         raise ValueError(
             f"--known-poses {capture}: none of its pictures has the file name of a photo, such as {photos[0].source.name}; rename them"
         )
-    return [dataclasses.replace(posed[photo.source.name], name=photo.name) if photo.source.name in posed else photo for photo in photos]
+    lenses = {photo.size: photo for photo in posed.values()}
+
+    def merged(photo: Photo) -> Photo:
+        if photo.source.name in posed:
+            return dataclasses.replace(posed[photo.source.name], name=photo.name)
+        lens = lenses.get(photo.size)  # a photo that tells no focal length was taken with the lens of posed photos of its size
+        if lens is None or photo.focal_prior is not None:
+            return photo
+        return dataclasses.replace(photo, focal_prior=lens.focal_prior, device=lens.device)
+
+    return [merged(photo) for photo in photos]
 
 
 def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | None:
@@ -202,8 +214,33 @@ def _work(
         }
         for view in range(len(path))
     ]
-    told = {"context": [job.photos[index].name for index in context], "passes": [len(chosen) for chosen in plan.passes.views]}
-    return found, NewViews(images=images, cameras=path, origins=origins), told
+    told: dict[str, Any] = {
+        "context": [job.photos[index].name for index in context],
+        "passes": [len(chosen) for chosen in plan.passes.views],
+    }
+    new = NewViews(images=images, cameras=path, origins=origins)
+    if options.check:
+        with _bars(), clock.stage("self-consistency"):
+            told["self_consistency"] = _self_consistency(job.photos, found, context, new, model, options)
+    return found, new, told
+
+
+def _self_consistency(
+    photos: list[Photo], found: FoundCameras, context: list[int], new: NewViews, model: Fillerbuster, options: CompleteOptions
+) -> dict[str, Any]:
+    """Poses, views, poses: how far the cameras of some photos and new views, looked for once more, are from those that were used."""
+    method = "features" if found.method == "features" else "model"
+    images, cameras = [], []
+    for index in context[:CHECKED]:
+        images.append(photos[index].load(_CHECKED_SIDE))
+        cameras.append(found.camera(index).scaled(images[-1].shape[2], images[-1].shape[1]))
+    for view in strided_subset(len(new.images), CHECKED):
+        images.append(new.images[view])
+        cameras.append(new.cameras[view])
+    cameras = [camera.to(torch.float64) for camera in cameras]
+    sampling = pose_sampling(model, options)
+    errors = self_consistency(images, cameras, method=method, model=model, seed=options.seed, sampling=sampling)
+    return {"method": method, "photos": min(len(context), CHECKED), "new_views": len(images) - min(len(context), CHECKED), **errors}
 
 
 def _path_of_file(options: CompleteOptions, side: int) -> Pinholes | None:

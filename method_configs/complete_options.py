@@ -11,6 +11,8 @@ from fb_core.fly_through import Passes, plan_passes, room_beside
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.model_registration import ROUNDS
 
+CHECKED = 8
+"""Photos, and new views, that the self-consistency is measured on."""
 POSES_AT_ONCE = 16
 """Photos whose raymaps are denoised together; more are registered in windows."""
 
@@ -49,6 +51,8 @@ class CompleteOptions:
     """Where to compute; None is a GPU if there is one."""
     fps: float = 8.0
     """Pictures per second of the film."""
+    check: bool = True
+    """Look for the cameras of photos and new views once more, and report how far they are off."""
 
     def __post_init__(self) -> None:
         for name, least in (("views", 1), ("photos", 1), ("sequence", 2), ("size", 16), ("steps", 1)):

@@ -29,7 +29,7 @@ COMMAND = "fillerbuster complete"
 _CHANNELS = tuple(f"{kind}.{axis}" for kind in ("origin", "direction") for axis in "xyz")
 _SHOWN_SIDE = 256
 _MODEL = "PINHOLE"
-_SHEET_COLUMNS, _MOST_SHOWN = 8, 48
+_SHEET_COLUMNS, _MOST_SHOWN, _CAPTION = 8, 48, 20
 _logger = logging.getLogger(__name__)
 
 
@@ -212,7 +212,7 @@ def _write_sheet(path: Path, photos: list[Photo], left_out: dict[str, str], foun
     trusted = found.trusted
     others = [index for index in range(len(photos)) if index not in trusted]
     strips = [
-        _strip("Photos with a camera", [photos[index] for index in trusted], [found.registration.verdicts[index] for index in trusted]),
+        _strip("Photos with a camera", [photos[index] for index in trusted], [""] * len(trusted)),
         _strip("Photos left out", [photos[index] for index in others], [found.registration.verdicts[index] for index in others]),
     ]
     count = 0 if new is None else len(new.images)
@@ -228,5 +228,5 @@ def _strip(heading: str, photos: list[Photo], verdicts: list[str]) -> Strip:
     return Strip(
         heading=f"{heading} ({len(photos)})" if len(shown) == len(photos) else f"{heading} ({len(shown)} of {len(photos)})",
         pictures=[photo.load(_SHOWN_SIDE) for photo, _ in shown],
-        captions=[f"{photo.name[:16]} {verdict}" for photo, verdict in shown],
+        captions=[f"{photo.name[: _CAPTION - len(verdict)]} {verdict}".strip() for photo, verdict in shown],
     )

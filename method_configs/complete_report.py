@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from fb_core.data.photos import Photo
-from fb_core.duration import expected_seconds
+from fb_core.duration import expected_seconds, in_words
 from fb_core.fly_through import FoundCameras
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.memory import GIB
-from method_configs.complete_options import POSES_AT_ONCE, CompleteOptions, Plan
+from fb_core.memory import GIB, bound
+from method_configs.complete_options import CHECKED, POSES_AT_ONCE, CompleteOptions, Plan
 from method_configs.complete_output import COMMAND
 
+_MOST_NAMED = 5  # photos that are left out, on the screen
 _METHODS = {"known": "given", "model": "by the model", "features": "by features"}
 
 
@@ -37,31 +38,34 @@ def announcement(
             / together
             * expected_seconds(model, views=together, known=together, side=model.size, sampling=pose_sampling, recovers_rays=True)
         )
-        memory = model.estimate(together, (model.size, model.size), pose_sampling).peak
+        memory = _memory(model, together, model.size, pose_sampling)
     name = "the bundled model" if options.model is None else f"model {options.model.name}"
     named = f"{name} ({model.model_hash[:8]})"
     if plan is None:
-        return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {_cost(seconds, memory)}."
+        return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {in_words(seconds, memory)}."
     for number, chosen in enumerate(plan.passes.views):
         views = plan.photos + len(chosen) + (plan.passes.anchors if number else 0)
         seconds += expected_seconds(model, views=views, known=views - len(chosen), side=plan.side, sampling=plan.sampling)
-    memory = max(memory, model.estimate(plan.longest, (plan.side, plan.side), plan.sampling, prompt=options.prompt).peak)
+    if options.check and options.cameras != "features":
+        assert pose_sampling is not None
+        seconds += expected_seconds(
+            model, views=2 * CHECKED, known=2 * CHECKED, side=model.size, sampling=pose_sampling, recovers_rays=True
+        )
+    memory = max(memory, _memory(model, plan.longest, plan.side, plan.sampling, options.prompt))
     count = len(plan.passes.views)
     passes = f"{count} {'pass' if count == 1 else 'passes'} of {plan.sampling.steps} steps over up to {plan.longest} views"
     along = f"along {Path(options.path).name}" if options.path.endswith(".json") else f"along the {options.path}"
     return (
         f"Completing the scene with {named}: {sum(map(len, plan.passes.views))} new views {along} of {plan.side}x{plan.side} pixels in "
-        f"{passes}, conditioned on {plan.photos} of {len(photos)} photos{posed}; {_cost(seconds, memory)}."
+        f"{passes}, conditioned on {plan.photos} of {len(photos)} photos{posed}; {in_words(seconds, memory)}."
     )
 
 
-def _cost(seconds: float, memory: int) -> str:
-    """In round numbers, which is all that is known."""
-    rounded = float(f"{seconds:.1g}")
-    if rounded >= 100:
-        minutes = max(2, round(seconds / 60))
-        return f"expected to take the model about {minutes} minutes and {memory / GIB:.1f} GiB"
-    return f"expected to take the model about {max(1, round(rounded))} s and {memory / GIB:.1f} GiB"
+def _memory(model: Fillerbuster, views: int, side: int, sampling: SamplingConfig, prompt: str | None = None) -> int:
+    """Bytes at most: generously where that is little, since a precise answer takes seconds."""
+    size, prompted = (side, side), bool(prompt)
+    generous = bound(views, size, model=model.config, sampling=sampling, prompted=prompted)[1]
+    return generous if generous < GIB else model.estimate(views, size, sampling, prompt=prompt).peak
 
 
 def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
@@ -72,10 +76,11 @@ def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
         lines[0] = (
             f"The model is sure of {found.tried['model']} of {len(photos)} cameras, features of {found.tried['features']}. " + lines[0]
         )
-    for index in range(len(photos)):
-        if index not in trusted:
-            reason = registration.reasons[index] or "there is no camera that fits"
-            lines.append(f"left out: {photos[index].name} ({registration.verdicts[index]}: {reason})")
+    others = [index for index in range(len(photos)) if index not in trusted]
+    for index in others[:_MOST_NAMED]:
+        lines.append(f"left out: {photos[index].name} ({registration.verdicts[index]}: {registration.reasons[index]})")
+    if len(others) > _MOST_NAMED:
+        lines.append(f"left out: {len(others) - _MOST_NAMED} more, named in report.json")
     return lines
 
 

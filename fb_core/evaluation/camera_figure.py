@@ -28,7 +28,7 @@ _MOST_POINTS = 20_000
 def draw_cameras(
     path: Path,
     cameras: Sequence[Pinholes],
-    pictures: Sequence[Float[Tensor, "3 h w"]],
+    pictures: Sequence[Float[Tensor, "3 _h _w"]],
     *,
     new: Pinholes | None = None,
     points: Points | None = None,

@@ -22,7 +22,7 @@ class Strip:
 
     heading: str
     """Stands above the pictures."""
-    pictures: Sequence[Float[Tensor, "3 h w"]]
+    pictures: Sequence[Float[Tensor, "3 _h _w"]]
     """RGB in [0, 1]; sizes may differ."""
     captions: Sequence[str] | None = None
     """One under each picture; None for none."""

@@ -38,7 +38,7 @@ def photo_of(image: Float[Tensor, "3 h w"], *, name: str, device: str, focal: fl
 
 
 def self_consistency(
-    images: Sequence[Float[Tensor, "3 h w"]],
+    images: Sequence[Float[Tensor, "3 _h _w"]],
     cameras: Sequence[Pinholes],
     *,
     method: Literal["model", "features"],

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+
+from fb_core.geometry.pose_refine import rotation_of
 
 _HUBER = 1.0  # tolerances beyond which a residual counts linearly
 _CONVERGED = 1e-6  # relative gain of a step
@@ -147,20 +150,20 @@ class _Equations:
         own = self.own + np.diag(damping * np.diag(self.own) + 1e-12)
         reduced = own - (eliminated @ self.mixed.T).toarray()
         right = self.gradient - eliminated @ self.point_gradient.ravel()
-        step = -np.linalg.lstsq(reduced, right, rcond=None)[0] if not _solvable(reduced) else -np.linalg.solve(reduced, right)
+        try:
+            step = -np.linalg.solve(reduced, right)
+        except np.linalg.LinAlgError:  # more damping will make it solvable
+            return bundle
         moved = -np.einsum("pij,pj->pi", inverse, self.point_gradient + (self.mixed.T @ step).reshape(-1, 3))
-        turns, shifts = step[: 6 * count].reshape(-1, 6)[:, :3], step[: 6 * count].reshape(-1, 6)[:, 3:]
+        turns, shifts = np.split(step[: 6 * count].reshape(-1, 6), 2, axis=1)
+        turned = rotation_of(torch.from_numpy(turns.copy())).numpy()
         return dataclasses.replace(
             bundle,
-            rotations=rotations_of(turns) @ bundle.rotations,
-            shifts=np.einsum("nij,nj->ni", rotations_of(turns), bundle.shifts) + shifts,
+            rotations=turned @ bundle.rotations,
+            shifts=np.einsum("nij,nj->ni", turned, bundle.shifts) + shifts,
             focal=bundle.focal * np.exp(np.clip(step[6 * count :], -0.5, 0.5)),
             points=bundle.points + moved,
         )
-
-
-def _solvable(matrix: np.ndarray) -> bool:
-    return bool(np.isfinite(matrix).all()) and np.linalg.cond(matrix) < 1e15
 
 
 def _jacobians(bundle: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,10 +189,3 @@ def _jacobians(bundle: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     of_camera = np.concatenate([by_seen @ skew, by_seen, by_focal], axis=2)
     of_point = by_seen @ bundle.rotations[bundle.camera_of]
     return of_camera * weight[:, None, None], of_point * weight[:, None, None], misses * weight[:, None]
-
-
-def rotations_of(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """exp([v]x): the rotations by |v| radians about v."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(vectors).as_matrix()
