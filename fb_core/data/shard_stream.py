@@ -18,7 +18,7 @@ import torch
 from fb_core.sampling.randomness import generator_of
 
 _logger = logging.getLogger(__name__)
-_BROKEN_SHARDS = 8  # in a row, before a stream gives up
+_BROKEN_SHARDS = 8  # in a row, or epochs without a sample, before a stream gives up
 
 
 def find_shards(place: str) -> list[str]:
@@ -67,7 +67,7 @@ class ShardStream:
         return self._latest[1]
 
     def _from(self, position: int) -> Iterator[dict[str, Any]]:
-        epoch, broken, skip = 0, 0, position
+        epoch, broken, empty, skip = 0, 0, 0, position
         while True:
             is_empty = True
             for shard in self._order(epoch):
@@ -85,7 +85,8 @@ class ShardStream:
                     _logger.warning("left out the rest of shard %s: %s", shard, error)
                     if broken >= _BROKEN_SHARDS:
                         raise ValueError(f"images: {broken} shards in a row could not be read, the last being {shard} ({error})") from error
-            if is_empty:
+            empty = empty + 1 if is_empty else 0
+            if empty >= _BROKEN_SHARDS:
                 raise ValueError(f"images: row {self.row} of {self.rows} finds no samples in {len(self.shards)} shards; give more of them")
             epoch += 1
 
