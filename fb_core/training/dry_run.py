@@ -11,7 +11,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from fb_core.live_bytes import LiveBytes
-from fb_core.training.distributed import ALONE, Group
+from fb_core.training.distributed import ALONE, Group, own_part
 from fb_core.training.loop import EngineConfig, Run
 from fb_core.training.recipe import Recipe, make_stage
 
@@ -73,12 +73,12 @@ def measure(recipe: Recipe, stage: str, *, device: torch.device, engine: EngineC
 
 
 def _bytes(network: nn.Module) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in network.state_dict().values())
+    return sum(own_part(tensor).numel() * tensor.element_size() for tensor in network.state_dict().values())
 
 
 def _optimizer_bytes(optimizer: torch.optim.Optimizer) -> int:
     tensors = (value for state in optimizer.state.values() for value in state.values() if isinstance(value, torch.Tensor))
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+    return sum(own_part(tensor).numel() * tensor.element_size() for tensor in tensors)
 
 
 def _matmul_rate(device: torch.device, dtype: torch.dtype) -> float:
