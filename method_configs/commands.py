@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from method_configs.ablation_evaluation import Ablations
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
@@ -75,6 +76,12 @@ def train(
     keep: int | None = None,
     tensorboard: bool = False,
     dry_run: bool = False,
+    captures: Path | None = None,
+    meshes: Path | None = None,
+    images: str | None = None,
+    rooms: bool = False,
+    text_encoder: Path | None = None,
+    lpips: Path | None = None,
 ) -> None:
     """Train a model from scratch; the same command again goes on where the last one ended. Under torchrun on many devices.
 
@@ -94,12 +101,19 @@ def train(
         keep: Checkpoints kept.
         tensorboard: Also write TensorBoard's files.
         dry_run: Only say sizes, memory and speed of the stages here, measured in a few steps; nothing is written.
+        captures: Folder with captures at any depth (each with a transforms.json) to learn from instead of rooms.
+        meshes: Folder with mesh files at any depth to learn from instead of rooms.
+        images: WebDataset shards of captioned pictures: a folder, or a pattern such as URL/{0000..9999}.tar.
+        rooms: Procedural rooms beside captures and meshes.
+        text_encoder: Clone of openai/clip-vit-large-patch14, for presets that read text.
+        lpips: Weights of SqueezeNet 1.1 as torchvision stores them, for the image autoencoder's perceptual loss.
     """
     from method_configs.training_command import train_preset
 
     train_preset(
         preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half, precision=precision, accumulate=accumulate,
-        recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run,
+        recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run, captures=captures,
+        meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips,
     )  # fmt: skip
 
 
@@ -269,6 +283,7 @@ def evaluate(
         Annotated[Rooms, tyro.conf.subcommand("rooms")]
         | Annotated[Scaling, tyro.conf.subcommand("scaling")]
         | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
+        | Annotated[Ablations, tyro.conf.subcommand("ablations")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

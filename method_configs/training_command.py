@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from fb_core.data.training_data import TrainingData
 from fb_core.training.distributed import Group, joined
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.loop import EngineConfig, OnProgress
@@ -45,16 +46,24 @@ def train_preset(
     keep: int | None = None,
     tensorboard: bool = False,
     dry_run: bool = False,
+    captures: Path | None = None,
+    meshes: Path | None = None,
+    images: str | None = None,
+    rooms: bool = False,
+    text_encoder: Path | None = None,
+    lpips: Path | None = None,
 ) -> Path | None:
     """Train what is not trained yet and export; returns the model's folder, or None while stages are missing.
 
     Stages end in order: when the time is up in one, those after it are not begun, because the transformer learns the latents of
     finished autoencoders. Options of the engine that are None or False are the preset's. Under torchrun all its processes train together.
+    The options from ``captures`` on say where the data lie (:class:`fb_core.data.training_data.TrainingData`).
 
     Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive. SystemExit when a signal
     ended it, after a checkpoint.
     """
-    recipe = _recipe(preset)
+    data = TrainingData(captures=captures, meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips)
+    recipe = dataclasses.replace(_recipe(preset), data=data)
     _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
     stages = STAGES if stage == "all" else (stage,)
     chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
