@@ -24,7 +24,7 @@ from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, make_room
 from fb_core.data.sequences import PoolConfig, RoomPool
-from fb_core.data.training_data import TrainingData, multi_view_source, resolution_of
+from fb_core.data.training_data import Resolution, TrainingData, multi_view_source, resolution_of
 from fb_core.data.training_task import Source, TaskConfig
 from fb_core.data.triangle_caster import cast_triangles
 from fb_core.sampling.randomness import generator_of
@@ -341,3 +341,30 @@ def test_resolutions_are_assigned_evenly():
 
     drawn = [resolution_of(PAPER.resolutions, seed=0, rank=rank) for rank in range(1000)]
     assert all(150 < drawn.count(one) < 250 for one in PAPER.resolutions)
+
+
+def test_all_three_stages_learn_from_captures_and_captioned_pictures(tiny_capture, shards, tmp_path):
+    """Adversarial autoencoders, then a transformer that changes its resolution on the way and ends in a model folder."""
+    from fb_core.networks.dit import DiTConfig
+    from fb_core.networks.vae import VAEConfig
+    from fb_core.training.dit_stage import DiTLossConfig
+    from fb_core.training.loop import LoopConfig
+    from fb_core.training.recipe import STAGES, Recipe, export, run_stage
+    from fb_core.training.vae_stage import VAELossConfig
+
+    small = {"widths": (8, 8, 8, 8), "encoder_resnets": 1, "decoder_resnets": 1, "norm": "none"}
+    loop, loss = LoopConfig(steps=3, save_every=3, warmup_steps=1), VAELossConfig(batch=2, adversarial=0.5, adversarial_from=1)
+    pool = PoolConfig(rooms=2, views=4, image_size=32, supersample=1)
+    recipe = Recipe(
+        name="own", image_vae=VAEConfig(**small), raymap_vae=VAEConfig(in_channels=6, **small), pool=pool, vae_pool=pool,
+        dit=DiTConfig(heads=1, head_dim=16, depth=1, text_width=0), image_vae_loop=loop, raymap_vae_loop=loop,
+        dit_loop=LoopConfig(steps=4, save_every=4, warmup_steps=1), image_vae_loss=loss, raymap_vae_loss=loss,
+        dit_loss=DiTLossConfig(batch=2, images_per_row=2, task=dataclasses.replace(TASK, views=2)), single_view_share=0.5,
+        resolutions=(Resolution(image_size=16, views=3, sequences=2, images=4),), resolutions_from=2,
+        data=TrainingData(captures=tiny_capture, images=str(shards)),
+    )  # fmt: skip
+    runs = [run_stage(recipe, stage, tmp_path) for stage in STAGES]
+    assert [run.step for run in runs] == [3, 3, 4] and all(np.isfinite(list(run.smoothed.values())).all() for run in runs)
+    assert set(runs[0].smoothed) == {"loss", "l1", "kl", "critic", "adversarial"}
+    export(recipe, tmp_path, tmp_path / "model")
+    assert (tmp_path / "model/config.json").is_file()
