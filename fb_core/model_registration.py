@@ -24,6 +24,8 @@ from fb_core.views import Views
 ROUNDS = 8
 """Random partitions into windows that are averaged in every step (paper)."""
 _TOLD = 1e-4  # relative deviation of told focal lengths: they stand, because raymaps err by far more than they scatter
+_FOCAL_SIDES = (0.05, 10.0)  # focal lengths in sides of the square that lenses have: 169 to 6 degrees of view
+_FEWEST_ANCHORS = 2  # one tells no scale
 _ANCHOR_SHARE = 0.25  # of a later window's views are photos that have a camera already
 
 
@@ -35,19 +37,15 @@ class Square:
     known: Float[Tensor, "1 s s"]
     whole: tuple[int, int]
     """(height, width) of the photo, pixels."""
-    loaded: tuple[int, int]
-    """(height, width) it was loaded at."""
 
     @staticmethod
     def of(photo: Photo, side: int) -> Square:
         """The square spans the photo's shorter side."""
-        height, width = photo.size
-        image, known = photo.load_with_mask(math.ceil(side * max(height, width) / min(height, width)))
-        loaded = (image.shape[1], image.shape[2])
-        left, top, short = _window(loaded)
+        image, known = photo.load_with_mask()
+        left, top, short = _window(photo.size)
         both = torch.cat([image, known])[:, top : top + short, left : left + short]
         both = F.interpolate(both[None], size=(side, side), mode="bilinear", antialias=True, align_corners=False)[0]
-        return Square(image=both[:3].clamp(0, 1), known=both[3:].clamp(0, 1), whole=photo.size, loaded=loaded)
+        return Square(image=both[:3].clamp(0, 1), known=both[3:].clamp(0, 1), whole=photo.size)
 
     @property
     def side(self) -> int:
@@ -56,20 +54,19 @@ class Square:
 
     def inside(self, camera: Pinholes) -> Pinholes:
         """The square's camera, from that of the whole photo."""
-        left, top, short = _window(self.loaded)
-        return camera.scaled(self.loaded[1], self.loaded[0]).cropped(left, top, short, short).scaled(self.side, self.side)
+        left, top, short = _window(self.whole)
+        return camera.cropped(left, top, short, short).scaled(self.side, self.side)
 
     def outside(self, camera: Pinholes) -> Pinholes:
         """The whole photo's camera, from that of the square: the inverse."""
-        left, top, short = _window(self.loaded)
-        loaded = camera.scaled(short, short).cropped(-left, -top, self.loaded[1], self.loaded[0])
-        return loaded.scaled(self.whole[1], self.whole[0])
+        left, top, short = _window(self.whole)
+        return camera.scaled(short, short).cropped(-left, -top, self.whole[1], self.whole[0])
 
     @property
     def principal(self) -> Float[Tensor, " 2"]:
         """Where the whole photo's middle is in the square."""
-        left, top, short = _window(self.loaded)
-        middle = torch.tensor([self.loaded[1] / 2 - left, self.loaded[0] / 2 - top], dtype=torch.float64)
+        left, top, short = _window(self.whole)
+        middle = torch.tensor([self.whole[1] / 2 - left, self.whole[0] / 2 - top], dtype=torch.float64)
         return middle * self.side / short
 
 
@@ -119,7 +116,9 @@ def recover_with_model(
     total, number = len(waiting), 0
     solved = _solved(photos, squares, raymaps)
     while waiting:
-        anchors = _anchors(solved, given, views_at_once if len(photos) <= views_at_once else max(1, round(_ANCHOR_SHARE * views_at_once)))
+        anchors = _anchors(
+            solved, given, views_at_once if len(photos) <= views_at_once else max(_FEWEST_ANCHORS, round(_ANCHOR_SHARE * views_at_once))
+        )
         if number and not anchors:
             break  # nothing ties a further window to the first
         room = max(1, views_at_once - len(anchors))
@@ -192,7 +191,10 @@ def _solved(photos: Sequence[Photo], squares: Sequence[Square], raymaps: Float[T
         )
         for place, index in enumerate(members):
             reasons[index] = found.reasons[place]
-            if found.verdicts[place] is Verdict.OK:
+            sides = float(found.cameras.focal[place, 0]) / squares[index].side
+            if found.verdicts[place] is Verdict.OK and not _FOCAL_SIDES[0] < sides < _FOCAL_SIDES[1]:
+                reasons[index] = f"its rays fit a camera of {math.degrees(2 * math.atan(0.5 / sides)):.2g} degrees of view only"
+            elif found.verdicts[place] is Verdict.OK:
                 cameras[index] = squares[index].outside(found.cameras[place].to(torch.float64))
                 residuals[index] = float(found.residual_degrees[place])
                 deviations[index] = float(found.covariance[place, 3, 3]) ** 0.5

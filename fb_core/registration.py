@@ -70,12 +70,12 @@ def register(
         views_at_once: photos that the model sees together.
         on_progress: called with what is being done, how much is done, and of how much.
 
-    Raises ValueError for fewer than two photos or `views_at_once` below 2, and for the method "model" without a model.
+    Raises ValueError for fewer than two photos or `views_at_once` below 3, and for the method "model" without a model.
     """
     if len(photos) < 2:
         raise ValueError(f"register: expected at least two photos, got {len(photos)}; one photo says nothing of where it was taken")
-    if views_at_once < 2:
-        raise ValueError(f"views_at_once: expected at least 2, got {views_at_once}")
+    if views_at_once < 3:
+        raise ValueError(f"views_at_once: expected at least 3 (two that tell place and scale, and a new one), got {views_at_once}")
     if method == "model" and model is None:
         raise ValueError("register: the method 'model' needs a model, got None; load one, or choose the method 'features'")
     report = on_progress or (lambda *_: None)

@@ -28,6 +28,8 @@ class Uncalibrated:
     """Rooms, the first ones, in which the closed loop poses, views, poses is measured too."""
     family: Literal["narrow", "medium", "wide"] = "narrow"
     """How varied room and cameras are; the bundled model knows narrow rooms."""
+    capture: Path | None = None
+    """A posed capture whose cameras are hidden and then compared with, instead of rooms; --views of its photos are taken."""
     seed: int = 0
     """Decides rooms, cameras and samples."""
     json: Path | None = None
@@ -35,15 +37,22 @@ class Uncalibrated:
 
     def run(self) -> None:
         """Measure and report."""
+        from fb_core.data.photos import read_photos
         from fb_core.evaluation.benchmarks import Report
-        from fb_core.evaluation.uncalibrated import UncalibratedTask, evaluate_uncalibrated, summary
+        from fb_core.evaluation.uncalibrated import UncalibratedTask, evaluate_capture, evaluate_uncalibrated, summary
         from fb_core.inpainter import Fillerbuster
         from method_configs.bench_command import show
 
-        names = ("rooms", "views", "path", "sides", "loops", "family", "seed")
-        task = UncalibratedTask(**{name: getattr(self, name) for name in names})
+        def say(what: str) -> None:
+            _logger.info("measuring %s", what)
+
         report = Report(seed=self.seed)
         model = Fillerbuster.from_pretrained(self.model)
-        outcomes = list(evaluate_uncalibrated(model, task, on_room=lambda what: _logger.info("measuring %s", what)))
-        report.rows.extend(summary(outcomes))
+        if self.capture is not None:
+            photos = read_photos(self.capture, most=self.views)
+            report.rows.extend(evaluate_capture(model, photos, seed=self.seed, on_method=say))
+        else:
+            names = ("rooms", "views", "path", "sides", "loops", "family", "seed")
+            task = UncalibratedTask(**{name: getattr(self, name) for name in names})
+            report.rows.extend(summary(list(evaluate_uncalibrated(model, task, on_room=say))))
         show(report, self.json, [])

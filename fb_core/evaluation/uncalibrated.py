@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.photos import Photo
 from fb_core.data.ray_caster import render
 from fb_core.evaluation.completion import mean_color, unseen_house, unseen_room
 from fb_core.evaluation.image_metrics import psnr
@@ -102,6 +103,28 @@ def evaluate_uncalibrated(
             outcome["closed loop", "true views"] = _closed_loop(model, scene, scene.path_images, seed)
             outcome["closed loop", "generated views"] = _closed_loop(model, scene, best, seed)
         yield outcome
+
+
+def evaluate_capture(
+    model: Fillerbuster, photos: Sequence[Photo], *, seed: int, on_method: Callable[[str], None] = lambda _: None
+) -> list[dict[str, Any]]:
+    """Rows of errors of photos whose cameras are known, once these are hidden: by the model and by features, focal lengths told or not."""
+    truth = [photo.camera for photo in photos if photo.camera is not None]
+    if len(truth) != len(photos) or len(photos) < 2:
+        raise ValueError(f"capture: expected at least two photos with cameras, got {len(photos)} photos, {len(truth)} of them with cameras")
+    rows: list[dict[str, Any]] = []
+    for method in ("features", "model"):
+        for told in (True, False):
+            name = f"{method}, focal length {'told' if told else 'unknown'}"
+            on_method(name)
+            hidden = [dataclasses.replace(photo, camera=None, focal_prior=photo.focal_prior if told else None) for photo in photos]
+            began = time.process_time()
+            found = register(hidden, method=method, model=model if method == "model" else None, seed=seed)
+            seconds = time.process_time() - began
+            trusted = sum(verdict == "ok" for verdict in found.verdicts) / len(photos)
+            row = pose_errors(found.cameras, truth) | {"trusted_share": trusted, "cpu_seconds": seconds}
+            rows.append({"part": f"{len(photos)} photos of a capture", "method": name} | row)
+    return rows
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from fb_core.geometry.feature_pairs import PhotoFeatures, angles_degrees, rays_of
 
-_GUESSES = np.geomspace(0.4, 3.0, 60)  # longer sides: 103 to 19 degrees of view
+_GUESSES = np.geomspace(0.4, 3.0, 16)  # longer sides: 103 to 19 degrees of view
+_PAIRS = 6  # with most matches, by which guesses are judged
+_MAY_MISS = 2.0  # tolerances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,19 +40,36 @@ class _Homography:
 def panorama_of(photos: Sequence[PhotoFeatures], matches: dict[tuple[int, int], Int[np.ndarray, "m 2"]], *, guess: float) -> Panorama:
     """The rotations that explain most matches, chained from the pair with most matches outwards.
 
-    All untold focal lengths are taken as one number of longer sides: the one that explains most, nearest to the guess if many do as well
-    (photos that are identical fit every focal length).
+    All untold focal lengths are taken as one number of longer sides: the one with which matches miss least, or the guess if
+    that does as well as any (photos that are identical fit every focal length).
     """
     homographies = _homographies(photos, matches)
     total = sum(len(found) for found in matches.values())
     if not homographies:
         return Panorama(rotations=[None] * len(photos), focal=_focal(photos, guess), share=0.0)
-    tried = sorted(_GUESSES, key=lambda value: abs(np.log(value / guess)))
-    tried = tried if any(photo.focal is None for photo in photos) else tried[:1]
-    explained = [sum(_turn(photos, one, _focal(photos, value))[1] for one in homographies) for value in tried]
-    focal = _focal(photos, float(tried[int(np.argmax(explained))]))
-    turns = {(one.first, one.second): _turn(photos, one, focal)[0] for one in homographies}
-    return Panorama(rotations=_chained(len(photos), turns), focal=focal, share=max(explained) / total)
+
+    def miss(sides: float) -> float:
+        return sum(len(one.places[0]) * float(np.median(_turn(photos, one, _focal(photos, sides))[1])) for one in homographies[:_PAIRS])
+
+    sides = guess
+    if any(photo.focal is None for photo in photos):
+        sides = _least(miss, start=guess)
+    focal = _focal(photos, sides)
+    turns, explained = dict[tuple[int, int], np.ndarray](), 0
+    for one in homographies:
+        turns[one.first, one.second], misses = _turn(photos, one, focal)
+        explained += int((misses < _MAY_MISS).sum())
+    return Panorama(rotations=_chained(len(photos), turns), focal=focal, share=explained / total)
+
+
+def _least(miss: Callable[[float], float], *, start: float) -> float:
+    """Where a positive function of the focal length is least: the best of a few, refined; the start if nothing beats it."""
+    from scipy.optimize import minimize_scalar
+
+    best = int(np.argmin([miss(float(guess)) for guess in _GUESSES]))
+    low, high = _GUESSES[max(0, best - 1)], _GUESSES[min(len(_GUESSES) - 1, best + 1)]
+    found: Any = minimize_scalar(miss, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
+    return float(found.x) if found.fun < miss(start) - 1e-3 else start
 
 
 def _homographies(photos: Sequence[PhotoFeatures], matches: dict[tuple[int, int], Int[np.ndarray, "m 2"]]) -> list[_Homography]:
@@ -69,15 +89,16 @@ def _focal(photos: Sequence[PhotoFeatures], sides: float) -> list[float]:
     return [photo.focal or sides * max(photo.size) for photo in photos]
 
 
-def _turn(photos: Sequence[PhotoFeatures], homography: _Homography, focal: Sequence[float]) -> tuple[Float[np.ndarray, "3 3"], int]:
-    """The rotation nearest to a homography between photos of given focal lengths, and how many matches it explains."""
+def _turn(
+    photos: Sequence[PhotoFeatures], homography: _Homography, focal: Sequence[float]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " m"]]:
+    """The rotation nearest to a homography between photos of given focal lengths, and by how many tolerances it misses the matches."""
     (first, second), (i, j) = homography.places, (homography.first, homography.second)
     normalised = np.diag([1 / focal[j], 1 / focal[j], 1]) @ homography.map @ np.diag([focal[i], focal[i], 1])
     left, _, right = np.linalg.svd(normalised * np.sign(np.linalg.det(normalised)))
     turn = left @ right
     angles = angles_degrees(rays_of(first / focal[i]) @ turn.T, rays_of(second / focal[j]))
-    limit = np.degrees(2 * max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j]))
-    return turn, int((angles < limit).sum())
+    return turn, np.radians(angles) / max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j])
 
 
 def _chained(count: int, turns: dict[tuple[int, int], Float[np.ndarray, "3 3"]]) -> list[Float[np.ndarray, "3 3"] | None]:
