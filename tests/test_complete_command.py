@@ -24,6 +24,7 @@ from fb_core.data import media
 from fb_core.data.captures import FrameToWrite, read_capture, validate_capture, write_capture
 from fb_core.data.points import Points, read_points
 from fb_core.evaluation.camera_figure import draw_cameras
+from fb_core.evaluation.contact_sheet import write_contact_sheet
 from fb_core.evaluation.pose_metrics import pose_errors
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.dataparser import without_open3d
@@ -40,6 +41,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(complete_output, "draw_cameras", functools.partial(draw_cameras, size=(120, 80)))
+    monkeypatch.setattr(complete_output, "write_contact_sheet", functools.partial(write_contact_sheet, dpi=20))
     monkeypatch.delenv(commands.DEBUG_VARIABLE, raising=False)
 
 
@@ -213,16 +215,16 @@ def _folder(path: Path) -> Path:
 
 
 def test_a_portrait_film_with_rotation_metadata(tmp_path: Path, model: Path):
-    pictures = render(cameras_on_an_arc(8, width=120, height=160, degrees=60))
+    pictures = render(cameras_on_an_arc(4, width=120, height=160, degrees=40))
     frames = [np.ascontiguousarray(np.rot90((one * 255).to(torch.uint8).movedim(0, -1).numpy())) for one in pictures]
     film = write_film(tmp_path / "film.mp4", frames, rotation=-90)
     report = complete(film, tmp_path / "out", tmp_path / "none", "--cameras", "features", "--poses-only")
     assert {(one["width"], one["height"]) for one in report["photos"]} == {(120, 160)}
-    assert report["cameras"]["trusted"] >= 4 and report["photos"][1]["seconds"] > 0
+    assert report["cameras"]["trusted"] >= 2 and report["photos"][1]["seconds"] > 0
     validate_capture(tmp_path / "out", decode=True)
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [17, pytest.param(100, marks=pytest.mark.slow)])
 def test_more_photos_than_fit_come_in_windows(tmp_path: Path, model: Path, capsys, count):
     generator = torch.Generator().manual_seed(0)
     _folder(tmp_path / "photos")
@@ -323,8 +325,10 @@ def test_only_ones_own_output_is_replaced_and_only_when_asked(tmp_path: Path, mo
         assert "holds the input" in refusal(capsys, tmp_path / "out", holds, model, "--overwrite")
 
 
-@pytest.mark.parametrize("owner, name", [(media, "write_image"), (complete_output, "write_film"), (complete_command, "write_report")])
-@pytest.mark.parametrize("replaces", [False, True])
+@pytest.mark.parametrize(
+    ("owner", "name", "replaces"),
+    [(media, "write_image", False), (complete_output, "write_film", True), (complete_command, "write_report", False)],
+)
 def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, model: Path, capsys, monkeypatch, owner, name, replaces):
     source = posed(tmp_path / "capture", cameras_on_an_arc(3, width=20, height=20))
     options = ("--overwrite",) if replaces else ()
