@@ -223,7 +223,10 @@ class _Composite(torch.autograd.Function):
             for number, (run, start) in reversed(list(enumerate(ctx.starts))):
                 last = number == len(ctx.starts) - 1
                 walked = ctx.walked if last else _walk(table, ellipses, ctx.strips, run, grid, start, settings, scratch)
-                splats = torch.cat([step.splats for stretch in walked for step in stretch.steps])
+                steps = [step.splats for stretch in walked for step in stretch.steps]
+                if not steps:
+                    continue  # what was chosen reaches no pixel
+                splats = torch.cat(steps)
                 rows = values.new_empty(splats.shape[0], sums.shape[1])
                 end = rows.shape[0]
                 for stretch in reversed(walked):

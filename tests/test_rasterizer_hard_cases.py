@@ -194,3 +194,17 @@ def test_equal_depths_keep_the_order_of_the_input():
     images = draw(splats(3, colors=colors, opacities=torch.full((3,), 0.9)), rasterize_mode="classic")[0]
     red, green, blue = images[0, 10, 12, :3].tolist()
     assert red > green > blue
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"opacities": torch.full((1,), 0.003)},  # nowhere as strong as 1/255
+        {"means": torch.tensor([[1.05, 0.9, 2.0]]), "opacities": torch.full((1,), 0.3)},  # its box touches the picture, its ellipse does not
+        {"scales": torch.full((1, 3), 1e-8), "means": torch.tensor([[0.0166, 0.0166, 2.0]]), "opacities": torch.full((1,), 0.0045)},
+    ],
+)
+def test_gaussians_that_reach_no_pixel_get_no_gradient(changes):
+    images, alphas, _, gradients = draw(splats(1, **changes), rasterize_mode="classic")
+    assert float(alphas.max()) == 0 and float(images[..., :3].abs().max()) == 0
+    assert all(float(gradients[name].abs().max()) == 0 for name in ("means", "scales", "opacities"))

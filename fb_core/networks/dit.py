@@ -186,7 +186,7 @@ class DiT(nn.Module):
         layout = layout_embedding(height // config.patch, width // config.patch, config.width, device=device)
         layout = rearrange(layout, "h w d -> 1 1 (h w) d")
         if config.index == "none":
-            return repeat(layout, "1 1 places d -> 1 (views places) d", views=views)
+            return repeat(layout, "1 1 places d -> b (views places) d", b=1 if index is None else index.shape[0], views=views)
         if index is None:
             index = index_positions(config.index, 1, views, device=device)
         if index.shape[1] != views:

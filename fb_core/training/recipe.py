@@ -125,17 +125,29 @@ def make_stage(
     image_vae, raymap_vae = (
         _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device) for kind in STAGES[:2]
     )
-    network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device)
-    task = DiTStage(
-        network,
+    encode_text = _encode_text(recipe, device, stands_in=folder is None) if recipe.dit.text_width else None
+    return dit_stage(recipe, image_vae, raymap_vae, device=device, rank=rank, encode_text=encode_text), recipe.dit_loop
+
+
+def dit_stage(
+    recipe: Recipe,
+    image_vae: VAE,
+    raymap_vae: VAE,
+    *,
+    device: torch.device | str = "cpu",
+    rank: int = 0,
+    encode_text: EncodeText | None = None,
+) -> DiTStage:
+    """The transformer with fresh weights between finished autoencoders."""
+    return DiTStage(
+        DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device),
         image_vae=image_vae,
         raymap_vae=raymap_vae,
         pool=_sequences(recipe, image_vae, device, rank),
         config=recipe.dit_loss,
         seed=recipe.seed,
-        encode_text=_encode_text(recipe, device, stands_in=folder is None) if recipe.dit.text_width else None,
+        encode_text=encode_text,
     )
-    return task, recipe.dit_loop
 
 
 def _sequences(recipe: Recipe, image_vae: VAE, device: torch.device | str, rank: int) -> Source:

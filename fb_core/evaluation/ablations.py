@@ -1,0 +1,131 @@
+"""The paper's comparison of model designs (table 2): sequences of N views of unseen rooms, N/4 known, N/4 partly, the rest generated."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.conditioning import encode_in_chunks, encode_known, join, unsplit
+from fb_core.data.rooms import FAMILIES
+from fb_core.evaluation.completion import RoomViews, unseen_room
+from fb_core.evaluation.image_metrics import psnr, ssim
+from fb_core.flow import validation_loss
+from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
+from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.masks import partly_known
+from fb_core.networks.embeddings import index_positions
+from fb_core.views import Views
+
+Distance = Callable[[Tensor, Tensor], Tensor]
+"""Perceptual distance of two batches of images in [0, 1]."""
+_CHUNK = 64  # views encoded at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationTask:
+    """What every design is asked."""
+
+    sequences: int = 50
+    """Sequences of each length (paper: 50)."""
+    lengths: tuple[int, ...] = (8, 16, 32)
+    """Views per sequence."""
+    times: int = 20
+    """Equally spaced times of the validation loss (paper: 20)."""
+    family: str = "narrow"
+    """Room family."""
+    seed: int = 0
+    """Decides rooms, cameras, masks and samples."""
+
+    def __post_init__(self) -> None:
+        if self.sequences < 1 or self.times < 1 or not self.lengths or min(self.lengths) < 4:
+            raise ValueError(f"ablations: expected sequences and times, and lengths of at least 4 views, got {self}")
+        if self.family not in FAMILIES:
+            raise ValueError(f"room family: expected one of {sorted(FAMILIES)}, got {self.family!r}")
+
+
+def quarter_masks(views: int, size: int, *, generator: torch.Generator) -> Float[Tensor, "n 1 h w"]:
+    """The first N/4 views known, the next N/2 unknown, the rest known but for rectangles."""
+    masks = torch.zeros(views, 1, size, size)
+    masks[: views // 4] = 1.0
+    for view in range(views // 4 + views // 2, views):
+        masks[view] = partly_known(size, size, generator=generator)
+    return masks
+
+
+def evaluate_design(
+    model: Fillerbuster,
+    task: AblationTask,
+    sampling: SamplingConfig,
+    *,
+    distance: Distance | None = None,
+    on_sequence: Callable[[int, int], None] = lambda done, total: None,
+) -> list[dict[str, float]]:
+    """One row for each length: means over sequences of PSNR (dB), SSIM, and the image channels' validation loss; LPIPS with a ``distance``.
+
+    Pictures are scored whole, in all views that were not wholly known; what was known of them counts too (as in the paper's code).
+    """
+    rows = []
+    for place, length in enumerate(task.lengths):
+        scores = []
+        for number in range(task.sequences):
+            room = unseen_room(family=task.family, seed=task.seed, number=number, views=length, size=model.size)
+            draw = torch.Generator().manual_seed(task.seed * 1_000_003 + number)
+            known = quarter_masks(length, model.size, generator=draw)
+            scores.append(_scores(model, room, known, task, sampling, task.seed + number, distance))
+            on_sequence(place * task.sequences + number + 1, len(task.lengths) * task.sequences)
+        means = {name: sum(score[name] for score in scores) / len(scores) for name in scores[0]}
+        rows.append({"views": length} | means)
+    return rows
+
+
+def _scores(
+    model: Fillerbuster,
+    room: RoomViews,
+    known: Float[Tensor, "n 1 h w"],
+    task: AblationTask,
+    sampling: SamplingConfig,
+    seed: int,
+    distance: Distance | None,
+) -> dict[str, float]:
+    views = dataclasses.replace(Views.known(room.images, room.cameras), image_known=known)
+    completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling).images
+    asked = (known < 1).flatten(1).any(dim=1)
+    pair = completed[asked], room.images[asked]
+    scores = {"psnr": float(psnr(*pair).mean()), "ssim": float(ssim(*pair).mean())}
+    if distance is not None:
+        scores["lpips"] = float(distance(*pair).mean())
+    return scores | {"val": conditional_validation_loss(model, room, known, times=task.times, seed=seed)}
+
+
+@torch.no_grad()
+def conditional_validation_loss(
+    model: Fillerbuster, room: RoomViews, known: Float[Tensor, "n 1 h w"], *, times: int = 20, seed: int = 0
+) -> float:
+    """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
+    rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+    vaes = {"image_vae": model.image_vae, "raymap_vae": model.raymap_vae}
+    conditioning = encode_known(room.images, known, rays, torch.ones_like(known), **vaes, views_at_once=_CHUNK)
+    data = unsplit(encode_in_chunks(model.image_vae, room.images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
+    noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed))
+    index = index_positions(model.dit.config.index, 1, data.shape[1])
+    text = None if model.text is None else model.text[None]
+
+    def network(state: Tensor, time: Tensor) -> Tensor:
+        return model.dit(join(state[0], conditioning)[None], time, text, index)
+
+    return float(validation_loss(network, data, noise, steps=times)[:, 0].mean())
+
+
+def interval(values: list[float]) -> tuple[float, float]:
+    """Mean, and half the width of its 95 % confidence interval (Student's t); of one value nan."""
+    from scipy.stats import t
+
+    numbers = torch.tensor(values, dtype=torch.float64)
+    if len(values) < 2:
+        return float(numbers.mean()), float("nan")
+    return float(numbers.mean()), float(t.ppf(0.975, len(values) - 1) * numbers.std() / len(values) ** 0.5)
