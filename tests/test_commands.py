@@ -238,8 +238,9 @@ def test_check_runs():
 
 
 def test_eval_in_miniature(tmp_path):
-    from fb_core.evaluation.completion import METHODS
     from tiny_models import save_tiny_model
+
+    from fb_core.evaluation.completion import METHODS
 
     arguments = [
         "--model",

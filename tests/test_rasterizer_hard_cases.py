@@ -200,7 +200,7 @@ def test_equal_depths_keep_the_order_of_the_input():
     "changes",
     [
         {"opacities": torch.full((1,), 0.003)},  # nowhere as strong as 1/255
-        {"means": torch.tensor([[1.05, 0.9, 2.0]]), "opacities": torch.full((1,), 0.3)},  # its box touches the picture, its ellipse does not
+        {"means": torch.tensor([[1.05, 0.9, 2.0]]), "opacities": torch.full((1,), 0.3)},  # the picture meets its box, not its ellipse
         {"scales": torch.full((1, 3), 1e-8), "means": torch.tensor([[0.0166, 0.0166, 2.0]]), "opacities": torch.full((1,), 0.0045)},
     ],
 )
