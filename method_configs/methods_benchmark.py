@@ -230,13 +230,19 @@ def trained(method: str, folder: Path, room: int, config: Methods) -> dict[str, 
 
 
 def quality_of(run: Path, capture: Path) -> dict[str, float]:
-    """PSNR, SSIM and holes on held-out views, covered and uncovered, and the number of generated views."""
+    """PSNR, SSIM and holes on held-out views, covered and uncovered, and the number of generated views; LPIPS where its weights are at hand."""
+    from fb_nerfstudio.lazy_lpips import LazyLpips
     from method_configs.held_out_views import render_held_out
 
-    views = render_held_out(run, capture)
+    views, lpips = render_held_out(run, capture), LazyLpips()
     row: dict[str, float] = {"generated": len(views.generated)}
     for kind, values in views.quality().items():
         row |= {f"{kind}_{name}": round(value, 4) for name, value in values.items()}
+        chosen = views.covered if kind == "covered" else ~views.covered
+        pairs = zip(views.renders[chosen].movedim(1, -1), views.truth[chosen].movedim(1, -1), strict=True)
+        distances = [distance for pair in pairs if (distance := lpips(*pair)) is not None]
+        if distances:
+            row[f"{kind}_lpips"] = round(sum(distances) / len(distances), 4)
     return row
 
 

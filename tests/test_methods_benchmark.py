@@ -9,9 +9,11 @@ import pytest
 import torch
 import tyro
 from nerfstudio.engine.trainer import TrainerConfig
+from test_demo import held_out
 
 from fb_core.data.captures import read_capture, validate_capture
-from method_configs import methods_benchmark, splats
+from fb_nerfstudio.lazy_lpips import LazyLpips
+from method_configs import held_out_views, methods_benchmark, splats
 from method_configs.methods_benchmark import (
     MASKED,
     NEW_VIEWS,
@@ -108,6 +110,17 @@ def test_means_and_bars():
     assert values["hole share on uncovered views"] == (0.02, 0.1, True)
     assert (29.6, 25.6, True) in values.values()
     assert bars_of([]) == []
+
+
+@pytest.mark.parametrize("weights", [True, False])
+def test_lpips_stands_in_the_row_where_its_weights_are_at_hand(weights: bool, monkeypatch: pytest.MonkeyPatch):
+    views = held_out(error=0.1, holes=0.5)
+    monkeypatch.setattr(held_out_views, "render_held_out", lambda run, capture: views)
+    monkeypatch.setattr(LazyLpips, "__call__", lambda self, first, second: float((first - second).abs().mean()) if weights else None)
+    row = methods_benchmark.quality_of(Path("run"), Path("capture"))
+    assert row["covered_psnr"] == pytest.approx(40, abs=1e-3) and ("covered_lpips" in row) is weights
+    if weights:
+        assert row["covered_lpips"] == pytest.approx(0.01, abs=1e-4) and row["uncovered_lpips"] == pytest.approx(0.1, abs=1e-4)
 
 
 def test_every_method_runs_on_every_room_and_a_second_benchmark_only_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
