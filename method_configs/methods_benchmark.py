@@ -230,7 +230,7 @@ def trained(method: str, folder: Path, room: int, config: Methods) -> dict[str, 
 
 
 def quality_of(run: Path, capture: Path) -> dict[str, float]:
-    """PSNR, SSIM and holes on held-out views, covered and uncovered, and the number of generated views; LPIPS where its weights are at hand."""
+    """PSNR, SSIM and holes on held-out views, covered and uncovered, how many views were generated; LPIPS where its weights are."""
     from fb_nerfstudio.lazy_lpips import LazyLpips
     from method_configs.held_out_views import render_held_out
 
