@@ -13,8 +13,8 @@ from torch import Tensor
 
 from fb_core.evaluation.contact_sheet import Strip, evenly, write_contact_sheet
 from fb_core.evaluation.image_metrics import psnr
-from fb_nerfstudio.bridge import batch_image, to_nerfstudio
-from fb_nerfstudio.completed_views import ANCHOR, CompletedViews
+from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio
+from fb_nerfstudio.completed_views import CompletedViews
 from method_configs.finished_run import load_run, quiet
 
 COLUMNS = 8
@@ -37,8 +37,8 @@ def write_sheet(run: Path, output: Path) -> None:
     bank: CompletedViews | None = manager.generated_views
     strips = _captured(pipeline, "Captured views", manager.cached_train, manager.train_dataset.cameras)
     if bank is not None:
-        strips += _generated(pipeline, "Generated anchors", bank, [i for i, one in enumerate(bank.origins) if one.role == ANCHOR])
-        strips += _generated(pipeline, "Generated densified views", bank, [i for i, one in enumerate(bank.origins) if one.role != ANCHOR])
+        for role in dict.fromkeys(one.role for one in bank.origins):
+            strips += _generated(pipeline, f"Generated, {role}", bank, [i for i, one in enumerate(bank.origins) if one.role == role])
     strips += _captured(pipeline, "Held-out views", manager.cached_eval, manager.eval_dataset.cameras)
     output.parent.mkdir(parents=True, exist_ok=True)
     count = f"{len(manager.train_dataset)} captured and {0 if bank is None else len(bank)} generated views"
@@ -51,7 +51,8 @@ def _captured(pipeline: Any, heading: str, batches: Sequence[dict], cameras: Any
     """Views of the capture and their renders. Pictures are cached undistorted, in the cameras' order."""
     chosen = evenly(range(len(batches)), COLUMNS)
     pictures = [batch_image(batches[index], "cpu") for index in chosen]
-    return _with_renders(pipeline, heading, len(batches), pictures, [cameras[index : index + 1] for index in chosen])
+    known = [batch_known(batches[index], "cpu") for index in chosen]
+    return _with_renders(pipeline, heading, len(batches), pictures, [cameras[index : index + 1] for index in chosen], known)
 
 
 def _generated(pipeline: Any, heading: str, bank: CompletedViews, indices: list[int]) -> list[Strip]:
@@ -60,12 +61,21 @@ def _generated(pipeline: Any, heading: str, bank: CompletedViews, indices: list[
     return _with_renders(pipeline, heading, len(indices), pictures, [to_nerfstudio(bank.cameras[index]) for index in chosen])
 
 
-def _with_renders(pipeline: Any, heading: str, total: int, pictures: list[Float[Tensor, "3 h w"]], cameras: list[Any]) -> list[Strip]:
-    """The pictures, and below them what the splats show there with its PSNR."""
+def _with_renders(
+    pipeline: Any,
+    heading: str,
+    total: int,
+    pictures: list[Float[Tensor, "3 h w"]],
+    cameras: list[Any],
+    known: list[Float[Tensor, "1 h w"]] | None = None,
+) -> list[Strip]:
+    """The pictures, and below them what the splats show there with its PSNR over the ``known`` pixels (default: all)."""
     renders, captions = [], []
-    for picture, camera in zip(pictures, cameras, strict=True):
+    for number, (picture, camera) in enumerate(zip(pictures, cameras, strict=True)):
         render = pipeline.model.get_outputs_for_camera(camera.to(pipeline.device))["rgb"].cpu().movedim(-1, 0).clamp(0, 1)
         renders.append(render)
-        captions.append(f"{float(psnr(render[None], picture[None])):.1f} dB")
+        counted = torch.ones_like(picture[0], dtype=torch.bool) if known is None else known[number][0] > 0
+        both = (image[None, :, counted, None] for image in (render, picture))
+        captions.append(f"{float(psnr(*both)):.1f} dB" if bool(counted.any()) else "")
     shown = Strip(heading=f"{heading} ({len(pictures)} of {total})", pictures=pictures)
     return [shown, Strip(heading="Rendered there", pictures=renders, captions=captions)]
