@@ -15,13 +15,14 @@ from torch import Tensor
 from fb_core.data.captures import Capture, FrameToWrite, write_capture
 from fb_core.geometry.cameras import Pinholes
 
-ANCHOR, DENSIFY, REQUESTED, INPAINTED = "anchor", "densify", "requested", "inpainted"
+ANCHOR, DENSIFY, REQUESTED, INPAINTED, BROUGHT = "anchor", "densify", "requested", "inpainted", "brought"
 _STATE_VERSION = 1
 
 
 def round_title(role: str, number: int) -> str:
     """What a person reads for a round."""
-    return {ANCHOR: "Anchors", INPAINTED: "Inpainted", REQUESTED: f"Requested {number}"}.get(role, f"Round {number}")
+    titles = {ANCHOR: "Anchors", INPAINTED: "Inpainted", REQUESTED: f"Requested {number}", BROUGHT: "From the capture"}
+    return titles.get(role, f"Round {number}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +30,8 @@ class Origin:
     """Where one generated view came from: enough to generate it again."""
 
     role: str
-    """``anchor`` (conditioned on the capture), ``densify`` or ``requested`` in the viewer (both on the capture and the anchors), or
-    ``inpainted``: a captured picture with its unknown pixels filled."""
+    """``anchor`` (conditioned on the capture), ``densify`` or ``requested`` in the viewer (both on the capture and the anchors),
+    ``inpainted``: a captured picture with its unknown pixels filled, or ``brought`` along by the capture."""
     round: int
     """Pass of the diffusion model, counted from 0; the views of one pass were generated together."""
     seed: int

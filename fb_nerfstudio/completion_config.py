@@ -52,6 +52,8 @@ class CompletionConfig:
     """Complete the capture with generated views; without, this is plain Gaussian splatting."""
     task: Literal["new-views", "inpaint"] = "new-views"
     """Generate views from new cameras, or fill the unknown parts of captured pictures (masks, alpha) and place no camera."""
+    on_completed_capture: Literal["take", "extend", "ignore"] = "take"
+    """A capture that brings generated views along: take these and generate none, generate others beside them, or leave them out."""
     model: Path | None = None
     """Folder of the diffusion model (config.json and safetensors); None is the small bundled model."""
     inpainter: Literal["diffusion", "grid"] = "diffusion"

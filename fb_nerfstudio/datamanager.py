@@ -20,14 +20,16 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from fb_core.data.captures import Frame
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
-from fb_nerfstudio.completed_views import REQUESTED, CompletedViews, round_title
+from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
+from fb_nerfstudio.completed_views import BROUGHT, REQUESTED, CompletedViews, round_title
 from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
-from fb_nerfstudio.completion_plan import plan_completion
-from fb_nerfstudio.dataparser import without_open3d
+from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
+from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
@@ -203,6 +205,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Checks before every iteration whether generated views are due and missing; refuses a broken model folder at once."""
         if self.config.completion.enabled and not self._finished:
             self._check_inpainter()
+        if not self._finished and (brought := len(self._brought_frames)):
+            CONSOLE.print(announcement_of_brought(brought, self.config.completion))
         self.completion_panel.training_begins(takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views")
         given = training_callback_attributes
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
@@ -221,6 +225,34 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             self._complete(attributes, step)
 
     def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Bring all generated views together: those that the capture brings along, and what is to be generated."""
+        brought = self._brought_frames if takes_brought(self.config.completion) else []
+        if not brought or self.config.completion.on_completed_capture == "extend":
+            self._generate(attributes, step)
+        if brought:  # last, in one step with the end: a run that goes on takes them once
+            self._take(brought, attributes, step)
+        self._finished = True
+        save_checkpoint(attributes.trainer, step)
+
+    @cached_property
+    def _brought_frames(self) -> list[Frame]:
+        """Generated frames of the capture, with cameras in the world of the splats."""
+        return self.dataparser.generated_frames() if isinstance(self.dataparser, NerfstudioWithoutOpen3d) else []
+
+    def _take(self, frames: list[Frame], attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Put generated views that the capture brings along into the bank as a round of their own."""
+        bank, cameras = self._bank, self._captured_cameras()
+        taken = [] if bank is None else bank.rounds
+        number = 1 + max([self.config.completion.densify_rounds, *taken])
+        with refusing():
+            views = brought_views(frames, number=number, size=None if bank is None else bank.cameras.width)
+        scene = self._scene(splats_of(attributes), cameras, step, size=views.cameras.width)
+        views, added = self._seed_unseen(views, attributes, scene.shell, cameras, step)
+        self._set_bank(merged(bank, (), views))
+        self._save_bank(attributes.trainer)
+        CONSOLE.print(f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen regions.")
+
+    def _generate(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
         started = time.perf_counter()
         config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
@@ -255,8 +287,6 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             where = "" if folder is None else f", saved in {folder}"
             seconds = time.perf_counter() - started
             CONSOLE.print(f"{len(done)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
-        self._finished = True
-        save_checkpoint(trainer, step)
 
     def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Do what was asked for in the viewer, one request before each iteration. What cannot be done is said there; training goes on."""
@@ -315,9 +345,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         started = time.perf_counter()
         config, splats = self.config.completion, splats_of(attributes)
         model, cameras = self._load_inpainter(), self._captured_cameras()
-        points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
-        survey = dataclasses.replace(config, anchor_views=0, densify_rounds=0, camera_path=None)
-        scene = plan_completion(cameras, points, survey, size=config.image_size or model.size, known=self._known_parts)
+        scene = self._scene(splats, cameras, step, size=config.image_size or model.size)
         planned = plan_request(request, scene, self._bank, cameras, config, self._known_parts)
         context = [self._captured_view(index, cameras[index]) for index in planned.plan.context]
         with Bars(self.completion_panel, 1) as bars:
@@ -334,6 +362,12 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             self._outdated = sorted({*self._outdated, *standing_on(self._bank, request.number)})
         follow = f" To be generated anew from the new anchors: {len(self._outdated)} rounds." if self._outdated else ""
         return f"{said}{added} Gaussians placed in holes.{follow}"
+
+    def _scene(self, splats: Any, cameras: list[Pinholes], step: int, *, size: int) -> CompletionPlan:
+        """Shape, shell and context of the capture: a plan without rounds."""
+        points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
+        survey = dataclasses.replace(self.config.completion, anchor_views=0, densify_rounds=0, camera_path=None)
+        return plan_completion(cameras, points, survey, size=size, known=self._known_parts)
 
     def _captured_cameras(self) -> list[Pinholes]:
         _ = self.cached_train  # undistortion changes the cameras, so it must come first
@@ -445,10 +479,10 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
 
 def _without_requested(bank: CompletedViews | None) -> tuple[CompletedViews | None, CompletedViews | None]:
-    """The automatic views of a bank, and those that were asked for in the viewer; None where there are none."""
+    """The automatic views of a bank, and those that the viewer or the capture gave; None where there are none."""
     if bank is None:
         return None, None
-    asked = [index for index, origin in enumerate(bank.origins) if origin.role == REQUESTED]
+    asked = [index for index, origin in enumerate(bank.origins) if origin.role in (REQUESTED, BROUGHT)]
     if not asked:
         return bank, None
     other = [index for index in range(len(bank)) if index not in set(asked)]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fb_core.data import media
-from fb_core.data.captures import Capture, Frame, write_transforms
+from fb_core.data.captures import Capture, Frame, split_lists, splits_of, write_transforms
 from fb_core.data.colmap_model import ColmapImage, write_colmap
 from fb_core.data.points import Points, read_points, write_points
 from fb_core.data.whole_folder import whole_folder
@@ -54,10 +54,7 @@ def write_export(
         captured = _captured_frames(completed, unfinished, held_out)
         generated = _generated_frames(completed, unfinished, masked=any(frame.mask_path for frame in captured))
         frames = [*captured, *generated]
-        kept_out = [frame for frame in captured if frame.extra["held_out"]]
-        trained = [frame for frame in frames if not frame.extra.get("held_out")]
-        splits: dict[str, list[Frame]] = {"train": trained, "val": kept_out, "test": kept_out}
-        (_write_colmap if format == "colmap" else _write_nerfstudio)(unfinished, completed.capture, frames, splits, points)
+        (_write_colmap if format == "colmap" else _write_nerfstudio)(unfinished, completed.capture, frames, points)
     return len(frames)
 
 
@@ -132,7 +129,7 @@ def _file_names(frames: Sequence[Frame]) -> list[str]:
     return names
 
 
-def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], splits: dict[str, list[Frame]], points: Points | None) -> None:
+def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], points: Points | None) -> None:
     """transforms.json with lists of the splits, and points3D.ply."""
     points_path = None if points is None and capture.points_path is None else folder / "points3D.ply"
     if points is not None:
@@ -140,18 +137,18 @@ def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], split
     elif points_path is not None and capture.points_path is not None:
         shutil.copyfile(capture.points_path, points_path)
     extra: dict[str, Any] = {key: value for key, value in capture.extra.items() if key not in _LENS_EXTRAS and key != "camera_model"}
-    extra |= {f"{split}_filenames": [f"images/{frame.image_path.name}" for frame in chosen] for split, chosen in splits.items()}
+    extra |= split_lists(frames, folder)
     write_transforms(Capture(root=folder, frames=tuple(frames), points_path=points_path, extra=extra), folder)
 
 
-def _write_colmap(folder: Path, capture: Capture, frames: list[Frame], splits: dict[str, list[Frame]], points: Points | None) -> None:
+def _write_colmap(folder: Path, capture: Capture, frames: list[Frame], points: Points | None) -> None:
     """sparse/0, lists of the splits as nerfstudio's COLMAP reader takes them, and the provenance of every picture."""
     if points is None:
         assert capture.points_path is not None  # the caller gives points where the capture has none
         points = read_points(capture.points_path)
     images = [ColmapImage(name=frame.image_path.name, camera=frame.camera) for frame in frames]
     write_colmap(folder / _COLMAP_FOLDER, images, points)
-    for split, chosen in splits.items():
+    for split, chosen in splits_of(frames).items():
         (folder / f"{split}_list.txt").write_text("".join(f"{frame.image_path.name}\n" for frame in chosen), encoding="utf-8")
     told = {frame.image_path.name: frame.extra for frame in frames}
     (folder / PROVENANCE_NAME).write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")

@@ -32,6 +32,8 @@ def refuse_bad_capture(config: Any) -> None:
         capture = validate_capture(Path(config.data or config.dataparser.data))
     except ValueError as error:
         raise Refused(str(error)) from None
+    if not capture.photos.frames:
+        raise Refused(f"capture {capture.root}: all of its {len(capture)} frames are marked as generated; give a capture with photos")
     scale = config.camera_res_scale_factor
     for frame in capture.frames:
         width, height = int(frame.camera.width * scale), int(frame.camera.height * scale)
@@ -42,7 +44,7 @@ def refuse_bad_capture(config: Any) -> None:
                 "use larger pictures"
             )
     try:
-        _refuse_masks(capture, config.completion)
+        _refuse_masks(capture.photos, config.completion)
     except ValueError as error:
         raise Refused(str(error)) from None
 

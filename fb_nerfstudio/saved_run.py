@@ -55,7 +55,7 @@ def read_completed(config: Any, checkpoint: dict[str, Any]) -> CompletedCapture:
     if not isinstance(config.pipeline.datamanager.dataparser, NerfstudioDataParserConfig):
         name = type(config.pipeline.datamanager.dataparser).__name__
         raise ValueError(f"expected a run on a capture with transforms.json, got one that was read by {name}")
-    capture = read_capture(data)
+    capture = read_capture(data).photos  # what it has of generated views is in the run's bank
     place = {str(frame.image_path): index for index, frame in enumerate(capture.frames)}
     trained = _trained(config, data)
     names = [str(path) for path in trained.image_filenames]

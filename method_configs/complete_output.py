@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media
-from fb_core.data.captures import Capture, Frame, write_transforms
+from fb_core.data.captures import Capture, Frame, split_lists, write_transforms
 from fb_core.data.film import write_film
 from fb_core.data.photos import Photo
 from fb_core.data.points import Points, read_points
@@ -29,6 +29,7 @@ COMMAND = "fillerbuster complete"
 _CHANNELS = tuple(f"{kind}.{axis}" for kind in ("origin", "direction") for axis in "xyz")
 _SHOWN_SIDE = 256
 _MODEL = "PINHOLE"
+_HELD_OUT_EVERY = 8  # photos; with fewer, all are trained on
 _SHEET_COLUMNS, _MOST_SHOWN, _CAPTION = 8, 48, 20
 _logger = logging.getLogger(__name__)
 
@@ -118,10 +119,11 @@ def _write_capture(folder: Path, photos: list[Photo], found: FoundCameras, new: 
     masks = [photos[index].load_mask() for index in trusted]
     masked = any(bool((mask < 1).any()) for mask in masks)
     frames = []
-    for index, mask in zip(trusted, masks, strict=True):
+    for place, (index, mask) in enumerate(zip(trusted, masks, strict=True)):
         photo, camera = photos[index], found.camera(index)
         verdict, residual = found.registration.verdicts[index], found.registration.residuals_degrees[index]
         extra = {"generated": False, "camera": verdict, **({} if math.isnan(residual) else {"residual_degrees": residual})}
+        extra |= {} if new is None else {"held_out": place % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1}
         frames.append(
             Frame(
                 image_path=_write_photo(photo, folder / "images", as_it_is=photo.camera is None or photo.source in world.straight),
@@ -131,9 +133,12 @@ def _write_capture(folder: Path, photos: list[Photo], found: FoundCameras, new: 
                 extra=extra,
             )
         )
-    frames += [] if new is None else _generated_frames(folder, new, {photo.name for photo in photos}, masked)
+    extra = world.extra
+    if new is not None:  # lists, since a reader's own choice would hold out generated frames as well
+        frames += _generated_frames(folder, new, {photo.name for photo in photos}, masked)
+        extra = extra | split_lists(frames, folder)
     points_path = folder / "points3D.ply" if with_points else None
-    write_transforms(Capture(root=folder, frames=tuple(frames), points_path=points_path, extra=world.extra), folder)
+    write_transforms(Capture(root=folder, frames=tuple(frames), points_path=points_path, extra=extra), folder)
 
 
 def _write_photo(photo: Photo, folder: Path, *, as_it_is: bool) -> Path:

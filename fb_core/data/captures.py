@@ -7,6 +7,7 @@ reading and writing bit for bit.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -56,6 +57,11 @@ class Frame:
     extra: dict[str, Any] = field(default_factory=dict)
     """All other keys of the frame, as they stand in the file."""
 
+    @property
+    def generated(self) -> bool:
+        """Whether the frame says that no camera took it."""
+        return bool(self.extra.get("generated", False))
+
     def load_image(self) -> Float[Tensor, "3 h w"]:
         """RGB in [0, 1] of the camera's size, bent as the lens bent it. Raises ValueError for a bad file or another size."""
         return self._load()[0]
@@ -102,6 +108,16 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def photos(self) -> Capture:
+        """The capture without its generated frames."""
+        return dataclasses.replace(self, frames=tuple(frame for frame in self.frames if not frame.generated))
+
+    @property
+    def has_split_lists(self) -> bool:
+        """Whether it says by name which frames are trained on and which are held out."""
+        return any(key in self.extra for key in _SPLIT_KEYS)
 
     @property
     def cameras(self) -> Pinholes:
@@ -224,6 +240,17 @@ def write_transforms(capture: Capture, folder: str | Path, *, overwrite: bool = 
     unfinished.write_text(to_json(meta, str(target)))
     os.replace(unfinished, target)
     return target
+
+
+def splits_of(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
+    """What readers are to train on (generated frames too), and what frames with ``held_out`` among their extras are for."""
+    held_out = [frame for frame in frames if frame.extra.get("held_out")]
+    return {"train": [frame for frame in frames if not frame.extra.get("held_out")], "val": held_out, "test": held_out}
+
+
+def split_lists(frames: Sequence[Frame], root: Path) -> dict[str, list[str]]:
+    """The splits as top-level keys of a transforms.json in ``root``: train_filenames, val_filenames, test_filenames."""
+    return {f"{split}_filenames": [_relative(frame.image_path, root) for frame in chosen] for split, chosen in splits_of(frames).items()}
 
 
 def write_capture(

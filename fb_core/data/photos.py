@@ -166,7 +166,7 @@ def _still_pixels(path: Path) -> Pixels:
 
 def _of_capture(folder: Path) -> list[Photo]:
     capture = read_capture(folder)
-    frames = [frame for frame in capture.frames if not frame.extra.get("generated", False)]
+    frames = capture.photos.frames
     if len(frames) < len(capture):
         _logger.info("capture %s: %d generated views are left out", folder, len(capture) - len(frames))
     names = _unique_names([frame.image_path.stem for frame in frames])

@@ -1,0 +1,76 @@
+"""Generated views that a capture brings along (from ``fillerbuster complete`` or ``export``), made ready for a run's bank."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from fb_core.data.captures import Frame
+from fb_core.data.media import resize
+from fb_core.geometry.cameras import Pinholes
+from fb_nerfstudio.completed_views import BROUGHT, CompletedViews, Origin
+from fb_nerfstudio.completion import fitted_rectangle
+from fb_nerfstudio.completion_config import CompletionConfig
+
+
+def takes_brought(config: CompletionConfig) -> bool:
+    """Whether a run trains on such views at all; one that inpaints captured pictures has no use for others."""
+    return config.enabled and config.task == "new-views" and config.on_completed_capture != "ignore"
+
+
+def announcement_of_brought(count: int, config: CompletionConfig) -> str:
+    """One sentence on what becomes of them."""
+    told = f"The capture brings {count} generated view{'' if count == 1 else 's'} along"
+    if not takes_brought(config):
+        return f"{told}: left out, only its photos count."
+    also = "others are generated beside them" if config.on_completed_capture == "extend" else "none are generated beside them"
+    return f"{told}: trained on as such from step {config.at_step} on, never as photos; {also} (completion.on_completed_capture)."
+
+
+def brought_views(frames: Sequence[Frame], *, number: int, size: int | None = None) -> CompletedViews:
+    """The frames as one round of square views.
+
+    Args:
+        frames: at least one, with cameras in the world of the splats.
+        number: of the round.
+        size: side of the views in pixels; None is the longest side of any frame. Frames of that size stay as they are, others are scaled,
+            and padded with pixels that are not trained on.
+
+    Raises ValueError in one sentence for a picture that cannot be read.
+    """
+    loaded = [frame.load_undistorted() for frame in frames]
+    side = size or max(max(image.shape[1:]) for image, _, _ in loaded)
+    pictures, cameras = zip(*(_fitted(torch.cat([image, mask]), camera, side) for image, mask, camera in loaded), strict=True)
+    views = torch.stack(pictures)
+    return CompletedViews(
+        images=rearrange((views[:, :3].clamp(0, 1) * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous(),
+        masks=rearrange(views[:, 3:] > 0.999, "n 1 h w -> n h w 1").contiguous(),
+        cameras=Pinholes.cat(list(cameras)),
+        origins=tuple(_origin(frame, number) for frame in frames),
+    )
+
+
+def _fitted(picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int) -> tuple[Float[Tensor, "4 side side"], Pinholes]:
+    """Colours and mask in the middle of a square; the mask is 0 around them."""
+    left, top, width, height = fitted_rectangle(camera.height, camera.width, side)
+    pads = (left, side - width - left, top, side - height - top)
+    return F.pad(resize(picture, height, width), pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
+
+
+def _origin(frame: Frame, number: int) -> Origin:
+    """What the frame says of its own origin, as far as it does."""
+    told = frame.extra
+    seed, aspect = told.get("seed"), told.get("aspect")
+    return Origin(
+        role=BROUGHT,
+        round=number,
+        seed=seed if isinstance(seed, int) else 0,
+        prompt=str(told.get("prompt") or ""),
+        model_hash=str(told.get("model_hash") or ""),
+        aspect=float(aspect) if isinstance(aspect, int | float) else frame.camera.width / frame.camera.height,
+    )
