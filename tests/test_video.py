@@ -287,7 +287,8 @@ def test_colours_are_decoded_as_they_are_tagged(tmp_path: Path, matrix: str, tag
 def test_hdr_colours_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     options = {"x264-params": "transfer=arib-std-b67:colorprim=bt2020:colormatrix=bt2020nc"}
     read_film(write_film(tmp_path / "hlg.mp4", pan([0, 3, 6]), **options), 3)
-    assert len(caplog.records) == 1 and "HDR" in caplog.text and "hlg.mp4" in caplog.text
+    told = [record.getMessage() for record in caplog.records if "HDR" in record.getMessage()]  # other records may be libav's own
+    assert len(told) == 1 and "hlg.mp4" in told[0]
 
 
 # ---- memory and work ------------------------------------------------------------------------------------------------
