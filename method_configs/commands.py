@@ -226,16 +226,17 @@ def demo(
     run_demo(output, seed=seed, iterations=iterations, model=model)
 
 
-def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path("sheet.png")) -> None:
+def sheet(run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path("sheet.png"), before: Path | None = None) -> None:
     """Draw what a run of ns-train was given, what it generated, and what it renders, as one picture.
 
     Args:
         run: Folder of the run, which holds config.yml.
         output: The picture.
+        before: Folder of another run on the same capture, drawn too at the same cameras, for a picture of before and after.
     """
     from method_configs.sheet import write_sheet
 
-    write_sheet(run, output)
+    write_sheet(run, output, before=before)
 
 
 def export(

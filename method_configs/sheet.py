@@ -23,23 +23,27 @@ _logger = logging.getLogger(__name__)
 
 @torch.no_grad()
 @quiet()
-def write_sheet(run: Path, output: Path) -> None:
+def write_sheet(run: Path, output: Path, *, before: Path | None = None) -> None:
     """Draw captured, generated and held-out views of a finished run, each above the run's render at the same camera.
 
     Args:
         run: folder of the run, which holds config.yml and checkpoints.
         output: the picture's file; missing folders are made.
+        before: folder of another run on the same capture, whose render at each of these cameras is drawn too.
 
     Raises ValueError when there is no finished run in the folder.
     """
     pipeline = load_run(run)
     manager: Any = pipeline.datamanager
     bank: CompletedViews | None = manager.generated_views
-    strips = _captured(pipeline, "Captured views", manager.cached_train, manager.train_dataset.cameras)
+    models = {"Rendered there": pipeline.model}
+    if before is not None:
+        models = {f"Rendered there by {before.resolve().parent.name}": load_run(before).model} | models
+    strips = _captured(models, "Captured views", manager.cached_train, manager.train_dataset.cameras)
     if bank is not None:
         for role in dict.fromkeys(one.role for one in bank.origins):
-            strips += _generated(pipeline, f"Generated, {role}", bank, [i for i, one in enumerate(bank.origins) if one.role == role])
-    strips += _captured(pipeline, "Held-out views", manager.cached_eval, manager.eval_dataset.cameras)
+            strips += _generated(models, f"Generated, {role}", bank, [i for i, one in enumerate(bank.origins) if one.role == role])
+    strips += _captured(models, "Held-out views", manager.cached_eval, manager.eval_dataset.cameras)
     output.parent.mkdir(parents=True, exist_ok=True)
     count = f"{len(manager.train_dataset)} captured and {0 if bank is None else len(bank)} generated views"
     title, subtitle = f"{run.parent.parent.name}, {run.parent.name}", f"{count}, {pipeline.model.num_points} Gaussians"
@@ -47,35 +51,38 @@ def write_sheet(run: Path, output: Path) -> None:
     _logger.info("wrote %s", output)
 
 
-def _captured(pipeline: Any, heading: str, batches: Sequence[dict], cameras: Any) -> list[Strip]:
+def _captured(models: dict[str, Any], heading: str, batches: Sequence[dict], cameras: Any) -> list[Strip]:
     """Views of the capture and their renders. Pictures are cached undistorted, in the cameras' order."""
     chosen = evenly(range(len(batches)), COLUMNS)
     pictures = [batch_image(batches[index], "cpu") for index in chosen]
     known = [batch_known(batches[index], "cpu") for index in chosen]
-    return _with_renders(pipeline, heading, len(batches), pictures, [cameras[index : index + 1] for index in chosen], known)
+    return _with_renders(models, heading, len(batches), pictures, [cameras[index : index + 1] for index in chosen], known)
 
 
-def _generated(pipeline: Any, heading: str, bank: CompletedViews, indices: list[int]) -> list[Strip]:
+def _generated(models: dict[str, Any], heading: str, bank: CompletedViews, indices: list[int]) -> list[Strip]:
     chosen = evenly(indices, COLUMNS)
     pictures = [bank.images[index].movedim(-1, 0).float() / 255 for index in chosen]
-    return _with_renders(pipeline, heading, len(indices), pictures, [to_nerfstudio(bank.cameras[index]) for index in chosen])
+    return _with_renders(models, heading, len(indices), pictures, [to_nerfstudio(bank.cameras[index]) for index in chosen])
 
 
 def _with_renders(
-    pipeline: Any,
+    models: dict[str, Any],
     heading: str,
     total: int,
     pictures: list[Float[Tensor, "3 h w"]],
     cameras: list[Any],
     known: list[Float[Tensor, "1 h w"]] | None = None,
 ) -> list[Strip]:
-    """The pictures, and below them what the splats show there with its PSNR over the ``known`` pixels (default: all)."""
-    renders, captions = [], []
-    for number, (picture, camera) in enumerate(zip(pictures, cameras, strict=True)):
-        render = pipeline.model.get_outputs_for_camera(camera.to(pipeline.device))["rgb"].cpu().movedim(-1, 0).clamp(0, 1)
-        renders.append(render)
-        counted = torch.ones_like(picture[0], dtype=torch.bool) if known is None else known[number][0] > 0
-        both = (image[None, :, counted, None] for image in (render, picture))
-        captions.append(f"{float(psnr(*both)):.1f} dB" if bool(counted.any()) else "")
-    shown = Strip(heading=f"{heading} ({len(pictures)} of {total})", pictures=pictures)
-    return [shown, Strip(heading="Rendered there", pictures=renders, captions=captions)]
+    """The pictures, and below them what each model's splats show there with its PSNR over the ``known`` pixels (default: all)."""
+    strips = [Strip(heading=f"{heading} ({len(pictures)} of {total})", pictures=pictures)]
+    counted = [torch.ones_like(picture[:1]) for picture in pictures] if known is None else known
+    for title, model in models.items():
+        renders = [model.get_outputs_for_camera(camera.to(model.device))["rgb"].cpu().movedim(-1, 0).clamp(0, 1) for camera in cameras]
+        captions = [_decibels(*three) for three in zip(renders, pictures, counted, strict=True)]
+        strips.append(Strip(heading=title, pictures=renders, captions=captions))
+    return strips
+
+
+def _decibels(render: Float[Tensor, "3 h w"], picture: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"]) -> str:
+    counted = known[0] > 0
+    return f"{float(psnr(render[None, :, counted, None], picture[None, :, counted, None])):.1f} dB" if bool(counted.any()) else ""

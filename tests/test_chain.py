@@ -304,5 +304,7 @@ def test_a_sheet_of_the_run(chain: Chain, tmp_path: Path):
     write_sheet(chain.resumed, tmp_path / "new" / "sheet.png")
     height, width = media.image_size(tmp_path / "new" / "sheet.png")
     assert width > 1000 and height > 1000
+    write_sheet(chain.resumed, tmp_path / "both.png", before=chain.resumed)
+    assert media.image_size(tmp_path / "both.png")[0] > 1.2 * height
     with pytest.raises(ValueError, match=r"no config\.yml there"):
         write_sheet(tmp_path, tmp_path / "sheet.png")
