@@ -123,9 +123,15 @@ def _trained(recipe: Recipe, folder: Path, autoencoders: Fillerbuster) -> Filler
         raise SystemExit(128 + run.signal)
     transformer = DiT(recipe.dit)
     transformer.load_state_dict(run.averaged_state())
-    vaes = {"image_vae": autoencoders.image_vae, "raymap_vae": autoencoders.raymap_vae}
-    config = dataclasses.replace(autoencoders.config, transformer=recipe.dit)
-    return Fillerbuster(Loaded(dit=transformer, config=config, info={"image_size": recipe.pool.image_size}, **vaes))
+    return Fillerbuster(
+        Loaded(
+            dit=transformer,
+            image_vae=autoencoders.image_vae,
+            raymap_vae=autoencoders.raymap_vae,
+            config=dataclasses.replace(autoencoders.config, transformer=recipe.dit),
+            info={"image_size": recipe.pool.image_size},
+        )
+    )
 
 
 def _counting(what: str, parts: int = 5) -> Callable[[int, int], None]:

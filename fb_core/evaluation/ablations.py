@@ -108,8 +108,9 @@ def conditional_validation_loss(
 ) -> float:
     """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
     rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
-    vaes = {"image_vae": model.image_vae, "raymap_vae": model.raymap_vae}
-    conditioning = encode_known(room.images, known, rays, torch.ones_like(known), **vaes, views_at_once=_CHUNK)
+    conditioning = encode_known(
+        room.images, known, rays, torch.ones_like(known), image_vae=model.image_vae, raymap_vae=model.raymap_vae, views_at_once=_CHUNK
+    )
     data = unsplit(encode_in_chunks(model.image_vae, room.images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
     noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed))
     index = index_positions(model.dit.config.index, 1, data.shape[1])
