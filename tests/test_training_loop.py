@@ -22,6 +22,7 @@ from fb_core.networks.dit import DiT
 from fb_core.training import dry_run
 from fb_core.training.distributed import ALONE
 from fb_core.training.loop import EngineConfig, LoopConfig, Run, Stage
+from fb_core.training.progress_log import ProgressLog
 from fb_core.training.recipe import make_sheet, make_stage
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,11 +89,25 @@ def test_sheets_and_data_made_ahead_change_nothing(whole, tmp_path):
     def sheet(path, state):
         torch.randn(3)  # a sheet may even use the global generator
         drawn.append((path.name, state["proj_out_2.weight"].clone()))
+        return {"val": 1 / len(drawn)}
 
     run = run_with(tmp_path, on_sheet=sheet, sheet_every=3, draw_ahead=True)
     assert [name for name, _ in drawn] == ["000003.png", "000006.png"]
     assert torch.equal(drawn[-1][1], whole.averaged_state()["proj_out_2.weight"])
     assert losses_of(tmp_path) == losses_of(whole.folder) and same(weights(run), weights(whole))
+    assert validation_of(tmp_path) == [{"step": 3, "val": 1.0}, {"step": 6, "val": 0.5}]
+
+
+def validation_of(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "validation.jsonl").read_text().splitlines()]
+
+
+def test_validation_of_steps_that_are_done_again_is_forgotten(tmp_path):
+    log = ProgressLog(tmp_path, "tiny", from_step=0)
+    for step in (2, 4):
+        log.add_validation(step, {"val": float(step)})
+    ProgressLog(tmp_path, "tiny", from_step=3)
+    assert validation_of(tmp_path) == [{"step": 2, "val": 2.0}]
 
 
 def test_the_last_checkpoints_are_kept_and_any_of_them_can_be_gone_on_from(whole, tmp_path):
@@ -291,6 +306,7 @@ def test_sheets_show_an_unseen_room(tmp_path, stage):
     from PIL import Image
 
     task, _ = make_stage(TOY, stage, None)
-    make_sheet(TOY, task)(tmp_path / "000003.png", task.network.state_dict())
+    measured = make_sheet(TOY, task)(tmp_path / "000003.png", task.network.state_dict())
     width, height = Image.open(tmp_path / "000003.png").size
     assert width > 300 and height > 200 and task.network.training
+    assert list(measured) == (["val"] if stage == "dit" else ["mean_error"]) and all(0 < value < 10 for value in measured.values())

@@ -74,8 +74,9 @@ def losses_of(folder: Path) -> list[float]:
 
 
 def run_in(folder: Path, group: Group, *, bad: tuple[int, int] | None = None, **engine: bool | int) -> Run:
-    def sheet(path: Path, state: dict[str, torch.Tensor]) -> None:
+    def sheet(path: Path, state: dict[str, torch.Tensor]) -> dict[str, float]:
         path.write_text(f"{state['proj_out_2.weight'].shape}")
+        return {"val": 0.0}
 
     return Run(TinyStage(bad), LOOP, folder, preset="tiny", engine=EngineConfig(**engine), group=group, on_sheet=sheet)  # type: ignore[arg-type]
 

@@ -107,13 +107,14 @@ def conditional_validation_loss(
     model: Fillerbuster, room: RoomViews, known: Float[Tensor, "n 1 h w"], *, times: int = 20, seed: int = 0
 ) -> float:
     """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
-    rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+    images, known = room.images.to(model.device), known.to(model.device)
+    rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras))).to(model.device)
     conditioning = encode_known(
-        room.images, known, rays, torch.ones_like(known), image_vae=model.image_vae, raymap_vae=model.raymap_vae, views_at_once=_CHUNK
+        images, known, rays, torch.ones_like(known), image_vae=model.image_vae, raymap_vae=model.raymap_vae, views_at_once=_CHUNK
     )
-    data = unsplit(encode_in_chunks(model.image_vae, room.images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
-    noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed))
-    index = index_positions(model.dit.config.index, 1, data.shape[1])
+    data = unsplit(encode_in_chunks(model.image_vae, images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
+    noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed)).to(data)
+    index = index_positions(model.dit.config.index, 1, data.shape[1], device=data.device)
     text = None if model.text is None else model.text[None]
 
     def network(state: Tensor, time: Tensor) -> Tensor:

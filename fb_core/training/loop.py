@@ -33,8 +33,8 @@ from fb_core.training.progress_log import ProgressLog
 _logger = logging.getLogger(__name__)
 OnProgress = Callable[[int, int, dict[str, float]], None]
 """(steps done, steps in all, latest smoothed losses)."""
-OnSheet = Callable[[Path, dict[str, Tensor]], None]
-"""Draws a sample sheet (a file to write) of the averaged weights."""
+OnSheet = Callable[[Path, dict[str, Tensor]], dict[str, float]]
+"""Draws a sample sheet (a file to write) of the averaged weights, and says how good they are on unseen data."""
 
 
 class Stage(ABC):
@@ -340,7 +340,9 @@ class Run:
         if self.group.is_main and self._on_sheet is not None and self.folder is not None:
             path = self.folder / "sheets" / f"{self.step:06d}.png"
             path.parent.mkdir(exist_ok=True)
-            self._on_sheet(path, state)
+            measured = self._on_sheet(path, state)
+            if self._log is not None:
+                self._log.add_validation(self.step, measured)
         self.group.wait()
 
     def save(self) -> None:

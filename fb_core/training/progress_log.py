@@ -1,4 +1,4 @@
-"""What a training leaves to read: ``log.jsonl`` with every step's losses, ``loss.png``, and TensorBoard's files on demand."""
+"""What a training leaves to read: ``log.jsonl`` with all losses, ``validation.jsonl``, ``loss.png``, and TensorBoard's files on demand."""
 
 from __future__ import annotations
 
@@ -15,21 +15,28 @@ class ProgressLog:
     def __init__(self, folder: Path, title: str, *, from_step: int, tensorboard: bool = False):
         """Lines of steps after ``from_step``, which will be done again, are dropped."""
         self.folder, self.title = folder, title
-        self._path = folder / "log.jsonl"
+        self._path, self._validation = folder / "log.jsonl", folder / "validation.jsonl"
         self._board = _board(folder / "tensorboard", from_step) if tensorboard else None
-        if self._path.exists():
-            kept = [line for line in self._path.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= from_step]
-            self._path.write_text("".join(line + "\n" for line in kept))
+        for path in (self._path, self._validation):
+            if path.exists():
+                kept = [line for line in path.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= from_step]
+                path.write_text("".join(line + "\n" for line in kept))
 
     def add(self, step: int, losses: dict[str, float], speed: dict[str, float]) -> None:
         """Note a step; ``speed`` goes to TensorBoard alone, so that two logs of one training are the same."""
-        with self._path.open("a") as log:
-            log.write(json.dumps({"step": step, **{name: round(value, 6) for name, value in losses.items()}}) + "\n")
+        _append(self._path, step, losses)
         if self._board is not None:
             for name, value in losses.items():
                 self._board.add_scalar(f"loss/{name}", value, step)
             for name, value in speed.items():
                 self._board.add_scalar(f"speed/{name}", value, step)
+
+    def add_validation(self, step: int, measured: dict[str, float]) -> None:
+        """Note how good the averaged weights are on unseen data."""
+        _append(self._validation, step, measured)
+        if self._board is not None:
+            for name, value in measured.items():
+                self._board.add_scalar(f"validation/{name}", value, step)
 
     def close(self) -> None:
         """Draw the curve of all losses."""
@@ -60,6 +67,11 @@ class ProgressLog:
         axes.legend()
         figure.savefig(self.folder / "loss.png", dpi=120)
         pyplot.close(figure)
+
+
+def _append(path: Path, step: int, values: dict[str, float]) -> None:
+    with path.open("a") as log:
+        log.write(json.dumps({"step": step, **{name: round(value, 6) for name, value in values.items()}}) + "\n")
 
 
 def _board(folder: Path, from_step: int):

@@ -1,4 +1,7 @@
-"""Sample sheets of a training: what the averaged weights make of an unseen room. They draw nothing that the training draws."""
+"""Looks at a training from outside: what the averaged weights make of unseen rooms, as a sheet and as numbers.
+
+Nothing is drawn here that the training draws.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ from fb_core.networks.vae import VAE, VAEConfig
 _logger = logging.getLogger(__name__)
 _DPI = 80
 _Network = TypeVar("_Network", DiT, VAE)
-Sheet = Callable[[Path, dict[str, Tensor]], None]
+Sheet = Callable[[Path, dict[str, Tensor]], dict[str, float]]
+_VALIDATED_ROOMS = 4
 
 
 def room_sheet(
@@ -35,27 +39,34 @@ def room_sheet(
     sampling: SamplingConfig,
     device: torch.device,
 ) -> Sheet:
-    """Sheets of the transformer: the second half of an unseen room's views, completed from the first half."""
+    """Sheets of the transformer: the second half of an unseen room's views, completed from the first half.
 
-    def draw(path: Path, state: dict[str, Tensor]) -> None:
+    The number is ``val``, the validation loss of the paper's table 2, over four unseen rooms.
+    """
+
+    def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
+        from fb_core.evaluation.ablations import conditional_validation_loss, quarter_masks
         from fb_core.evaluation.completion import complete_hidden, unseen_room
 
         architecture = ModelConfig(transformer=config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
         dit = _with_weights(DiT(config), state, device)
         model = Fillerbuster(Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=architecture))
-        room = unseen_room(family=family, seed=0, number=0, views=views, size=size)
-        known = max(1, views // 2)
+        rooms = [unseen_room(family=family, seed=0, number=number, views=views, size=size) for number in range(_VALIDATED_ROOMS)]
+        masks = quarter_masks(views, size, generator=torch.Generator().manual_seed(0))
+        losses = [conditional_validation_loss(model, each, masks, seed=number) for number, each in enumerate(rooms)]
+        room, known = rooms[0], max(1, views // 2)
         given, hidden = room[:known], room[known:]
         completed = complete_hidden(model, given, hidden.cameras, sampling, seed=0)
         _write(path, {"Known": given.images, "Generated": completed, "Truth": hidden.images})
+        return {"val": sum(losses) / len(losses)}
 
     return draw
 
 
 def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> Sheet:
-    """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after."""
+    """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after; ``mean_error`` is over them."""
 
-    def draw(path: Path, state: dict[str, Tensor]) -> None:
+    def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
         from fb_core.evaluation.completion import unseen_room
 
         network = _with_weights(VAE(config), state, device)
@@ -63,9 +74,10 @@ def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: in
         is_image = config.in_channels == 3
         values = room.images if is_image else to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
         with torch.no_grad():
-            decoded = network.decode(encode_in_chunks(network, values.to(device), 16))
+            decoded = network.decode(encode_in_chunks(network, values.to(device), 16)).to(values)
         rows = {"Truth": values, "Reconstructed": decoded}
         _write(path, rows if is_image else {f"{name} directions": value[:, 3:] for name, value in rows.items()})
+        return {"mean_error": float((decoded - values).abs().mean())}
 
     return draw
 
