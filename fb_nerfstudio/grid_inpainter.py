@@ -19,6 +19,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.telea import telea
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 
@@ -109,14 +110,9 @@ class OpenCvInpainter:
         self, image: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"], *, seed: int, sampling: SamplingConfig, prompt: str
     ) -> Float[Tensor, "3 h w"]:
         """The picture with its unknown pixels continued from the known ones; mid-grey where nothing is known."""
-        import cv2
-
         if not bool((known > 0).any()):
             return torch.full_like(image, 0.5)
-        pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-        hole = (known[0] < 1).to(torch.uint8).numpy() * 255
-        filled = cv2.inpaint(pixels, hole, _TELEA_RADIUS, cv2.INPAINT_TELEA)
-        return torch.from_numpy(filled).permute(2, 0, 1).float() / 255
+        return telea(image, known[0] >= 1, radius=_TELEA_RADIUS)
 
 
 class DiffusersInpainter:

@@ -7,9 +7,10 @@ import pytest
 import torch
 from tiny_models import save_tiny_model, tiny_model
 
-from fb_core.evaluation.ablations import AblationTask, conditional_validation_loss, evaluate_design, interval, quarter_masks
+from fb_core.evaluation.ablations import AblationTask, conditional_validation_loss, evaluate_design, interval
 from fb_core.evaluation.completion import unseen_room
 from fb_core.inpainter import SamplingConfig
+from fb_core.masks import training_mixture
 from method_configs import ablation_evaluation
 from method_configs.ablation_evaluation import Ablations, claims
 
@@ -18,7 +19,7 @@ DESIGNS = ("base", "no-index-emb", "fixed-index-emb", "no-poses", "random-poses"
 
 @pytest.mark.parametrize("views", [4, 8, 16, 32, 9])
 def test_a_quarter_is_known_half_unknown_and_the_rest_partly_known(views):
-    share = quarter_masks(views, 32, generator=torch.Generator().manual_seed(0)).flatten(1).mean(dim=1)
+    share = training_mixture(views, 32, 32, generator=torch.Generator().manual_seed(0), in_order=True).flatten(1).mean(dim=1)
     known, unknown = views // 4, views // 2
     assert bool((share[:known] == 1).all()) and bool((share[known : known + unknown] == 0).all())
     assert bool(((share[known + unknown :] > 0) & (share[known + unknown :] < 1)).all())
@@ -27,7 +28,7 @@ def test_a_quarter_is_known_half_unknown_and_the_rest_partly_known(views):
 def test_a_network_that_answers_nothing_has_the_velocity_s_own_size_as_validation_loss(tmp_path):
     model = tiny_model(tmp_path)
     room = unseen_room(family="narrow", seed=0, number=0, views=4, size=32)
-    masks = quarter_masks(4, 32, generator=torch.Generator().manual_seed(0))
+    masks = training_mixture(4, 32, 32, generator=torch.Generator().manual_seed(0), in_order=True)
     for parameter in model.dit.parameters():
         parameter.zero_()
     latents = model.image_vae.encode(room.images)

@@ -82,6 +82,12 @@ FAMILIES = {
 """The curriculum by name: narrow, medium, wide."""
 
 
+def require_family(name: str) -> None:
+    """Raises ValueError unless there is such a family."""
+    if name not in FAMILIES:
+        raise ValueError(f"room family: expected one of {sorted(FAMILIES)}, got {name!r}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Room:
     """Solids, materials and light of one room; solid 0 is the shell. Boxes come first, then cylinders, then spheres.

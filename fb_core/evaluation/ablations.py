@@ -11,13 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import encode_in_chunks, encode_known, join, unsplit
-from fb_core.data.rooms import FAMILIES
+from fb_core.data.rooms import require_family
 from fb_core.evaluation.completion import RoomViews, unseen_room
 from fb_core.evaluation.image_metrics import psnr, ssim
 from fb_core.flow import validation_loss
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.masks import partly_known
+from fb_core.masks import training_mixture
 from fb_core.networks.embeddings import index_positions
 from fb_core.views import Views
 
@@ -44,17 +44,7 @@ class AblationTask:
     def __post_init__(self) -> None:
         if self.sequences < 1 or self.times < 1 or not self.lengths or min(self.lengths) < 4:
             raise ValueError(f"ablations: expected sequences and times, and lengths of at least 4 views, got {self}")
-        if self.family not in FAMILIES:
-            raise ValueError(f"room family: expected one of {sorted(FAMILIES)}, got {self.family!r}")
-
-
-def quarter_masks(views: int, size: int, *, generator: torch.Generator) -> Float[Tensor, "n 1 h w"]:
-    """The first N/4 views known, the next N/2 unknown, the rest known but for rectangles."""
-    masks = torch.zeros(views, 1, size, size)
-    masks[: views // 4] = 1.0
-    for view in range(views // 4 + views // 2, views):
-        masks[view] = partly_known(size, size, generator=generator)
-    return masks
+        require_family(self.family)
 
 
 def evaluate_design(
@@ -75,7 +65,7 @@ def evaluate_design(
         for number in range(task.sequences):
             room = unseen_room(family=task.family, seed=task.seed, number=number, views=length, size=model.size)
             draw = torch.Generator().manual_seed(task.seed * 1_000_003 + number)
-            known = quarter_masks(length, model.size, generator=draw)
+            known = training_mixture(length, model.size, model.size, generator=draw, in_order=True)
             scores.append(_scores(model, room, known, task, sampling, task.seed + number, distance))
             on_sequence(place * task.sequences + number + 1, len(task.lengths) * task.sequences)
         means = {name: sum(score[name] for score in scores) / len(scores) for name in scores[0]}

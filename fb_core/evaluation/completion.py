@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
-from fb_core.data.rooms import FAMILIES, Room, make_room
+from fb_core.data.rooms import FAMILIES, Room, make_room, require_family
 from fb_core.evaluation.image_metrics import psnr
 from fb_core.evaluation.reprojection import inpainted, reproject
 from fb_core.geometry.cameras import Pinholes
@@ -41,8 +41,7 @@ class CompletionTask:
     def __post_init__(self) -> None:
         if not 1 <= self.known < self.views or self.rooms < 1:
             raise ValueError(f"evaluation: expected 1 <= known < views and at least one room, got {self}")
-        if self.family not in FAMILIES:
-            raise ValueError(f"room family: expected one of {sorted(FAMILIES)}, got {self.family!r}")
+        require_family(self.family)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +134,12 @@ def summary(results: list[RoomResult]) -> dict[str, dict[str, float]]:
     """Mean PSNR over rooms and its standard error, per method."""
     table = {}
     for method in METHODS:
-        values = torch.tensor([result.psnr[method] for result in results], dtype=torch.float64)
-        error = float(values.std() / len(values) ** 0.5) if len(values) > 1 else 0.0
-        table[method] = {"psnr": float(values.mean()), "standard_error": error}
+        table[method] = mean_psnr([result.psnr[method] for result in results])
     return table
+
+
+def mean_psnr(values: Sequence[float]) -> dict[str, float]:
+    """Mean over rooms (dB) and its standard error; 0 of a single room."""
+    numbers = torch.tensor(values, dtype=torch.float64)
+    error = float(numbers.std() / len(numbers) ** 0.5) if len(numbers) > 1 else 0.0
+    return {"psnr": float(numbers.mean()), "standard_error": error}

@@ -7,6 +7,7 @@ from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fb_core.data.telea import telea
 from fb_core.geometry.cameras import Pinholes
 
 _NEAREST = 1.02  # points of one pixel within this factor of the nearest depth are the same surface
@@ -43,16 +44,9 @@ def _draw(pixels: Float[Tensor, "p 2"], depths: Float[Tensor, "p"], colors: Floa
 
 
 def inpainted(images: Float[Tensor, "m 3 h w"], known: Bool[Tensor, "m h w"]) -> Float[Tensor, "m 3 h w"]:
-    """The unknown pixels filled from their surroundings (Telea 2004, OpenCV); a picture of which nothing is known comes back grey."""
-    import cv2
-
-    filled = []
-    for image, mask in zip(images, known, strict=True):
-        if not bool(mask.any()):
-            filled.append(torch.full_like(image, 0.5))
-            continue
-        bytes_ = (rearrange(image, "c h w -> h w c").clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        holes = (~mask).to(torch.uint8).numpy()
-        patched = torch.from_numpy(cv2.inpaint(bytes_, holes, _INPAINT_RADIUS, cv2.INPAINT_TELEA)).to(image) / 255
-        filled.append(torch.where(mask, image, rearrange(patched, "h w c -> c h w")))
-    return torch.stack(filled)
+    """The unknown pixels filled from their surroundings; a picture of which nothing is known comes back grey."""
+    filled = [
+        telea(image, mask, radius=_INPAINT_RADIUS) if bool(mask.any()) else torch.full_like(image, 0.5)
+        for image, mask in zip(images, known, strict=True)
+    ]
+    return torch.where(known[:, None], images, torch.stack(filled))

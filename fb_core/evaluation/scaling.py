@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import torch
-
-from fb_core.data.rooms import FAMILIES
-from fb_core.evaluation.completion import RoomViews, complete_hidden, unseen_room
+from fb_core.data.rooms import require_family
+from fb_core.evaluation.completion import RoomViews, complete_hidden, mean_psnr, unseen_room
 from fb_core.evaluation.image_metrics import psnr
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig
@@ -41,8 +39,7 @@ class ScalingTask:
     """Decides rooms, cameras and samples."""
 
     def __post_init__(self) -> None:
-        if self.family not in FAMILIES:
-            raise ValueError(f"room family: expected one of {sorted(FAMILIES)}, got {self.family!r}")
+        require_family(self.family)
         if self.rooms < 1 or self.scored < 1 or min((*self.contexts, self.known, *self.lengths), default=1) < 1:
             raise ValueError(f"scaling: expected at least one room, scored view, known view and length, got {self}")
         shortest = min(self.lengths, default=1) * self.trained_views
@@ -63,28 +60,23 @@ def evaluate_scaling(
     for known in task.contexts:
         on_room(f"{known} known views")
         errors = _errors(model, rooms, known, 0, task, sampling)
-        rows.append({"part": "context", "known": known, "views": known + task.scored} | _mean(errors))
+        rows.append({"part": "context", "known": known, "views": known + task.scored} | mean_psnr(errors))
     for length in task.lengths:
         views = length * task.trained_views
         on_room(f"{views} views in one sequence")
         errors = _errors(model, rooms, task.known, views - task.known - task.scored, task, sampling)
-        rows.append({"part": "length", "known": task.known, "views": views} | _mean(errors))
+        rows.append({"part": "length", "known": task.known, "views": views} | mean_psnr(errors))
     return rows
 
 
 def _errors(
     model: Fillerbuster, rooms: Iterable[RoomViews], known: int, unscored: int, task: ScalingTask, sampling: SamplingConfig
-) -> torch.Tensor:
+) -> list[float]:
     """PSNR of the scored views in each room, completed together with further unknown views."""
     means = []
     for number, room in enumerate(rooms):
         scored, given, further = room[: task.scored], room[task.scored : task.scored + known], room[task.scored + known :][:unscored]
         asked = Pinholes.cat([scored.cameras, further.cameras]) if unscored else scored.cameras
         completed = complete_hidden(model, given, asked, sampling, seed=task.seed + number)
-        means.append(psnr(completed[: task.scored], scored.images).mean())
-    return torch.stack(means).double()
-
-
-def _mean(errors: torch.Tensor) -> dict[str, float]:
-    spread = float(errors.std() / len(errors) ** 0.5) if len(errors) > 1 else 0.0
-    return {"psnr": float(errors.mean()), "standard_error": spread}
+        means.append(float(psnr(completed[: task.scored], scored.images).mean()))
+    return means

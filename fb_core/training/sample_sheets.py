@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,13 +17,14 @@ from fb_core.checkpoint import Loaded, ModelConfig
 from fb_core.conditioning import encode_in_chunks
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.masks import training_mixture
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.training.loop import OnSheet
 
 _logger = logging.getLogger(__name__)
 _DPI = 80
 _Network = TypeVar("_Network", DiT, VAE)
-Sheet = Callable[[Path, dict[str, Tensor]], dict[str, float]]
 _VALIDATED_ROOMS = 4
 
 
@@ -38,21 +38,21 @@ def room_sheet(
     size: int,
     sampling: SamplingConfig,
     device: torch.device,
-) -> Sheet:
+) -> OnSheet:
     """Sheets of the transformer: the second half of an unseen room's views, completed from the first half.
 
     The number is ``val``, the validation loss of the paper's table 2, over four unseen rooms.
     """
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
-        from fb_core.evaluation.ablations import conditional_validation_loss, quarter_masks
+        from fb_core.evaluation.ablations import conditional_validation_loss
         from fb_core.evaluation.completion import complete_hidden, unseen_room
 
         architecture = ModelConfig(transformer=config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
         dit = _with_weights(DiT(config), state, device)
         model = Fillerbuster(Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=architecture))
         rooms = [unseen_room(family=family, seed=0, number=number, views=views, size=size) for number in range(_VALIDATED_ROOMS)]
-        masks = quarter_masks(views, size, generator=torch.Generator().manual_seed(0))
+        masks = training_mixture(views, size, size, generator=torch.Generator().manual_seed(0), in_order=True)
         losses = [conditional_validation_loss(model, each, masks, seed=number) for number, each in enumerate(rooms)]
         room, known = rooms[0], max(1, views // 2)
         given, hidden = room[:known], room[known:]
@@ -63,7 +63,7 @@ def room_sheet(
     return draw
 
 
-def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> Sheet:
+def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> OnSheet:
     """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after; ``mean_error`` is over them."""
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
