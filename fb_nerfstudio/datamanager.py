@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import random
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -12,24 +11,24 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.data.captures import Frame
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
-from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list
+from fb_nerfstudio.bank import Bank, without_requested
 from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
-from fb_nerfstudio.completed_views import BROUGHT, REQUESTED, CompletedViews, round_title
-from fb_nerfstudio.completion import CapturedView, Inpainter, announcement, run_completion
+from fb_nerfstudio.captured_views import CapturedViewsDatamanager
+from fb_nerfstudio.completed_views import CompletedViews, round_title
+from fb_nerfstudio.completion import Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.fitting_in import fitted_in
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
@@ -47,19 +46,7 @@ from fb_nerfstudio.requests import (
     without_view,
 )
 from fb_nerfstudio.start_points import start_points
-from fb_nerfstudio.unseen import (
-    SOLID,
-    TRAINED_STEPS,
-    coarse,
-    coarse_mask,
-    find_unseen,
-    render_geometry,
-    seen_by_nobody_else,
-    surface_points,
-    unseen_gaussians,
-    with_matched_colors,
-    with_unseen_masks,
-)
+from fb_nerfstudio.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
 from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
 COMPLETION_FOLDER = "completion"
@@ -83,7 +70,7 @@ class FillerbusterDataManagerConfig(FullImageDatamanagerConfig):
             raise ValueError(f"start_points: expected 0 or more, got {self.start_points}")
 
 
-class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
+class FillerbusterDataManager(CapturedViewsDatamanager):
     """Captured views as in nerfstudio, plus generated views in a bank of their own.
 
     Generated views never enter the training dataset: its size is frozen into camera optimizers and strategies. They come
@@ -115,13 +102,9 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             self._find_start_points()
         self.completion_panel = CompletionPanel(prompt=config.completion.prompt)  # public: nerfstudio's viewer looks for it by type
         self.completion_panel.captured = len(self.train_dataset)
-        self._bank: CompletedViews | None = None
-        self._bank_cameras: Cameras | None = None
-        self._bank_shares: list[float] = []  # of each generated view, the share of its pixels that is trained on
+        self._bank: Bank | None = None
         self._finished = False
         self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
-        self._captured_draws = 0
-        self._epoch: tuple[int, list[int]] = (-1, [])
 
     def _find_start_points(self) -> None:
         """Give the pipeline points to start the splats from, where the capture brings none."""
@@ -136,68 +119,24 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
     @property
     def generated_views(self) -> CompletedViews | None:
-        """The bank: every generated view so far, None before there are any."""
-        return self._bank
+        """Every generated view so far, None before there are any."""
+        return None if self._bank is None else self._bank.views
 
     @property
     def generated_probability(self) -> float:
         """Probability that a step draws a generated view."""
         if self._bank is None:
             return 0.0
-        generated = sum(self._bank_shares)  # a view of which only a third is trained on counts as a third of a view
-        return min(self.config.completion.generated_share, generated / (generated + len(self.train_dataset)))
+        return self._bank.probability(most=self.config.completion.generated_share, captured=len(self.train_dataset))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """A captured or a generated view, decided by the completion's seed and the step."""
         if self._bank is not None:
-            draws = np.random.default_rng([self.config.completion.seed % 2**63, step])
-            if draws.random() < self.generated_probability:
-                chances = np.array(self._bank_shares) / sum(self._bank_shares)
-                return self._generated_batch(self._bank, int(draws.choice(len(self._bank), p=chances)))
-        if self.config.train_cameras_sampling_strategy != "random":
-            return super().next_train(step)
-        _ = self.cached_train  # loads images on first use, and with them train_cameras
-        return self._captured_batch(self._next_captured_index())
-
-    def _next_captured_index(self) -> int:
-        """Every captured view once per epoch in an order of the epoch's own, so that a resumed run goes on where it was."""
-        epoch, place = divmod(self._captured_draws, len(self.train_dataset))
-        if self._epoch[0] != epoch:
-            order = list(range(len(self.train_dataset)))
-            random.Random(self.config.train_cameras_sampling_seed * 1_000_003 + epoch).shuffle(order)
-            self._epoch = (epoch, order)
-        self._captured_draws += 1
-        return self._epoch[1][place]
-
-    def _captured_batch(self, index: int) -> tuple[Cameras, dict]:
-        data = self.cached_train[index].copy()
-        data["image"] = data["image"].to(self.device)
-        camera = self.train_cameras[index : index + 1].to(self.device)
-        camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
-        return camera, data
-
-    def _generated_batch(self, bank: CompletedViews, index: int) -> tuple[Cameras, dict]:
-        image = bank.images[index]
-        if self.config.cache_images_type == "float32":
-            image = image.float() / 255
-        batch: dict[str, Any] = {"image": image.to(self.device), "mask": bank.masks[index].to(self.device)}
-        batch["view_weight"] = self.config.completion.view_weight
-        assert self._bank_cameras is not None  # is set together with the bank
-        return self._bank_cameras[index : index + 1], batch
-
-    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict[str, torch.Tensor]]:
-        """As in nerfstudio, but alpha becomes part of the mask (transparent is unknown), for training, evaluation and context alike.
-
-        Without CUDA images stay in ordinary memory, where nerfstudio would pin them and crash.
-        """
-        if cache_images_device == "cpu" and torch.device(self.device).type != "cuda":
-            cache_images_device = "gpu"  # means "on self.device"
-        loaded = super()._load_images(split, cache_images_device)
-        for data in loaded:
-            if data["image"].shape[-1] == 4:
-                data["mask"] = batch_known(data).movedim(0, -1) >= 0.5
-                data["image"] = data["image"][..., :3].contiguous()
-        return loaded
+            completion = self.config.completion
+            index = self._bank.drawn(step, seed=completion.seed, probability=self.generated_probability)
+            if index is not None:
+                return self._bank.batch(index, as_float=self.config.cache_images_type == "float32", weight=completion.view_weight)
+        return self.next_captured(step)
 
     # ------------------------------------------------------------------------------------------------------ generation
 
@@ -241,13 +180,13 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
     def _take(self, frames: list[Frame], attributes: TrainingCallbackAttributes, step: int) -> None:
         """Put generated views that the capture brings along into the bank as a round of their own."""
-        bank, cameras = self._bank, self._captured_cameras()
+        bank, cameras = self.generated_views, self.captured_cameras()
         taken = [] if bank is None else bank.rounds
         number = 1 + max([self.config.completion.densify_rounds, *taken])
         with refusing():
             views = brought_views(frames, number=number, size=None if bank is None else bank.cameras.width)
         scene = self._scene(splats_of(attributes), cameras, step, size=views.cameras.width)
-        views, added = self._seed_unseen(views, attributes, scene.shell, cameras, step)
+        views, added = self._fitted_in(views, attributes, scene.shell, step)
         self._set_bank(merged(bank, (), views))
         self._save_bank(attributes.trainer)
         CONSOLE.print(f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen regions.")
@@ -256,32 +195,32 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
         started = time.perf_counter()
         config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
-        model, cameras = self._load_inpainter(), self._captured_cameras()
+        model, cameras = self._load_inpainter(), self.captured_cameras()
         points = self._seen_points(splats, cameras, step)
         inpaints, size = config.task == "inpaint", config.image_size or model.size
         generate = run_inpainting if inpaints else run_completion
         if inpaints:
             plan = plan_inpainting(cameras, points, config, size=size)
         else:
-            plan = plan_completion(cameras, points, config, size=size, known=self._known_parts)
-        done, _ = _without_requested(self._bank)
+            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts)
+        done, _ = without_requested(self.generated_views)
         if plan.rounds:
             with refusing():
                 told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
             CONSOLE.print(told)
-            context = LazyViews(lambda index: self._captured_view(index, cameras[index]), plan.context)
+            context = LazyViews(lambda index: self.captured_view(index, cameras[index]), plan.context)
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))
             with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
                 for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
                     left -= 1
-                    self._set_bank(merged(self._bank, (), views))
+                    self._set_bank(merged(self.generated_views, (), views))
                     if left > 0:
                         save_checkpoint(trainer, step)
         del model
         release_memory()
-        done, requested = _without_requested(self._bank)
+        done, requested = without_requested(self.generated_views)
         if done is not None:
-            done, added = self._seed_unseen(done, attributes, plan.shell, cameras, step)
+            done, added = self._fitted_in(done, attributes, plan.shell, step)
             self._set_bank(done if requested is None else CompletedViews.cat([done, requested]))
             folder = self._save_bank(trainer)
             where = "" if folder is None else f", saved in {folder}"
@@ -317,16 +256,16 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
 
     def _next_outdated(self) -> RegenerateRound | None:
         """A round that stands on anchors which are no more, to be generated as it was, from the new ones."""
-        there = [] if self._bank is None else self._bank.rounds
+        there = [] if self.generated_views is None else self.generated_views.rounds
         self._outdated = [number for number in self._outdated if number in there]
         waits = self.config.completion.enabled and self._outdated
         return RegenerateRound(number=self._outdated[0], seed=None) if waits else None
 
     def _remove(self, request: RemoveView, attributes: TrainingCallbackAttributes) -> str:
-        before, place = self._bank, place_of(self._bank, request.key)
+        before, place = self.generated_views, place_of(self.generated_views, request.key)
         after = without_view(before, request.key)
         assert before is not None and place is not None  # without_view has raised otherwise
-        gone = self._forget(before[[place]], after, self._captured_cameras(), attributes)
+        gone = self._forget(before[[place]], after, self.captured_cameras(), attributes)
         self._set_bank(after)
         return f"1 view removed, with {gone} Gaussians that no other view shows; {views_in_words(len(after or ()))} left."
 
@@ -337,29 +276,29 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         splats = splats_of(attributes)
         if not hasattr(splats, "remove_gaussians"):
             return 0
-        gone = seen_by_nobody_else(splats.means, leaving, staying, cameras, self._known_parts)
+        gone = seen_by_nobody_else(splats.means, leaving, staying, cameras, self.known_parts)
         return splats.remove_gaussians(gone, attributes.optimizers)
 
     def _generate_requested(self, request: CompleteFrom | RegenerateRound, attributes: TrainingCallbackAttributes, step: int) -> str:
         """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
         started = time.perf_counter()
         config, splats = self.config.completion, splats_of(attributes)
-        model, cameras = self._load_inpainter(), self._captured_cameras()
+        model, cameras = self._load_inpainter(), self.captured_cameras()
         scene = self._scene(splats, cameras, step, size=config.image_size or model.size)
-        planned = plan_request(request, scene, self._bank, cameras, config, self._known_parts)
-        context = [self._captured_view(index, cameras[index]) for index in planned.plan.context]
+        planned = plan_request(request, scene, self.generated_views, cameras, config, self.known_parts)
+        context = [self.captured_view(index, cameras[index]) for index in planned.plan.context]
         with Bars(self.completion_panel, 1) as bars:
             (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found)
         del model
         release_memory()
-        if self._bank is not None and planned.replaces:
-            self._forget(self._bank[planned.replaces], planned.done, cameras, attributes)
-        new, added = self._seed_unseen(new, attributes, scene.shell, cameras, step, holes_only=True)
-        self._set_bank(merged(self._bank, planned.replaces, new))
+        if self.generated_views is not None and planned.replaces:
+            self._forget(self.generated_views[planned.replaces], planned.done, cameras, attributes)
+        new, added = self._fitted_in(new, attributes, scene.shell, step, holes_only=True)
+        self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
         said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
         if isinstance(request, RegenerateRound) and request.seed is not None:
-            self._outdated = sorted({*self._outdated, *standing_on(self._bank, request.number)})
+            self._outdated = sorted({*self._outdated, *standing_on(self.generated_views, request.number)})
         follow = f" To be generated anew from the new anchors: {len(self._outdated)} rounds." if self._outdated else ""
         return f"{said}{added} Gaussians placed in holes.{follow}"
 
@@ -367,16 +306,7 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         """Shape, shell and context of the capture: a plan without rounds."""
         points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
         survey = dataclasses.replace(self.config.completion, anchor_views=0, densify_rounds=0, camera_path=None)
-        return plan_completion(cameras, points, survey, size=size, known=self._known_parts)
-
-    def _captured_cameras(self) -> list[Pinholes]:
-        _ = self.cached_train  # undistortion changes the cameras, so it must come first
-        return [camera.to("cpu") for camera in to_pinhole_list(self.train_cameras)]
-
-    @cached_property
-    def _known_parts(self) -> list[torch.Tensor | None]:
-        """Of each captured picture a small mask of what is known there, None where all is."""
-        return [coarse_mask(batch_known(data, "cpu")) if "mask" in data else None for data in self.cached_train]
+        return plan_completion(cameras, points, survey, size=size, known=self.known_parts)
 
     def _check_inpainter(self) -> None:
         """Raises Refused with one sentence for a model folder that cannot be used."""
@@ -399,51 +329,26 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
             groups.append(surface_points(splats, cameras))
         return torch.cat(groups) if groups else None
 
-    def _captured_view(self, index: int, camera: Pinholes) -> CapturedView:
-        data = self.cached_train[index]
-        return CapturedView(image=batch_image(data, "cpu"), known=batch_known(data, "cpu"), camera=camera)
-
-    def _seed_unseen(
-        self,
-        views: CompletedViews,
-        attributes: TrainingCallbackAttributes,
-        shell: Shell,
-        cameras: list[Pinholes],
-        step: int,
-        holes_only: bool = False,
+    def _fitted_in(
+        self, views: CompletedViews, attributes: TrainingCallbackAttributes, shell: Shell, step: int, holes_only: bool = False
     ) -> tuple[CompletedViews, int]:
-        """Match colours, mask and seed what the capture has not seen (``holes_only``: where no splats are either).
-
-        Returns the views as they are to be trained on, and the number of new Gaussians.
-        """
-        config, splats = self.config.completion, splats_of(attributes)
-        if config.task == "inpaint":  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
-            return views, 0
-        seeds = config.seed_gaussians and hasattr(splats, "add_gaussians")
-        if not seeds and config.generated_pixels == "all":
-            return views, 0
-        rendered = render_geometry(splats, coarse(views.cameras)) if step >= TRAINED_STEPS else None
-        unseen = find_unseen(views, cameras, shell, rendered, self._known_parts)
-        if config.match_colors and rendered is not None:
-            views = with_matched_colors(views, unseen, rendered)
-        if config.generated_pixels == "unseen":
-            views = with_unseen_masks(views, unseen)
-        if not seeds:
-            return views, 0
-        if holes_only and rendered is not None:
-            unseen = dataclasses.replace(unseen, mask=unseen.mask & (rendered.accumulation < SOLID))
-        generator = torch.Generator().manual_seed(config.seed)
-        points, colors = unseen_gaussians(views, unseen, limit=config.max_seed_gaussians, generator=generator)
-        if len(points) == 0:
-            return views, 0
-        return views, splats.add_gaussians(points.to(self.device), colors.to(self.device), attributes.optimizers)
+        """The views as they are to be trained on, and how many Gaussians were added for them."""
+        return fitted_in(
+            views,
+            splats_of(attributes),
+            attributes.optimizers,
+            self.config.completion,
+            shell=shell,
+            captured=self.captured_cameras(),
+            known=self.known_parts,
+            trained=step >= TRAINED_STEPS,
+            holes_only=holes_only,
+        )
 
     # ----------------------------------------------------------------------------------------------------- persistence
 
     def _set_bank(self, views: CompletedViews | None) -> None:
-        self._bank = views
-        self._bank_cameras = None if views is None else to_nerfstudio(views.cameras, self.device)
-        self._bank_shares = [] if views is None else views.masks.double().mean(dim=(1, 2, 3)).tolist()
+        self._bank = None if views is None else Bank.of(views, self.device)
         self.completion_panel.show(views)
 
     def _save_bank(self, trainer: Any) -> Path | None:
@@ -451,8 +356,8 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
         if trainer is None:
             return None
         folder = Path(trainer.base_dir) / COMPLETION_FOLDER
-        if self._bank is not None:
-            self._bank.save_capture(folder)
+        if self.generated_views is not None:
+            self.generated_views.save_capture(folder)
         elif folder.exists():
             shutil.rmtree(folder)
         return folder
@@ -460,30 +365,19 @@ class FillerbusterDataManager(FullImageDatamanager[InputDataset]):
     def get_extra_state(self) -> dict[str, Any]:
         """The bank and the place in the sequence of draws; lands in the checkpoint as ``datamanager._extra_state``."""
         return {
-            "views": None if self._bank is None else self._bank.state(),
+            "views": None if self.generated_views is None else self.generated_views.state(),
             "finished": self._finished,
             "outdated": list(self._outdated),
             "start_points": self._own_points,
-            "captured_draws": self._captured_draws,
+            "captured_draws": self.captured_draws,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`get_extra_state` gave; nothing is generated again."""
         self._finished = bool(state["finished"])
-        self._captured_draws = int(state["captured_draws"])
+        self.captured_draws = int(state["captured_draws"])
         self._outdated = [int(number) for number in state.get("outdated", ())]
         if state.get("start_points") is not None:  # not triangulated again: interrupted rounds are planned from the very same points
             self._own_points = state["start_points"].cpu()
             self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
-
-
-def _without_requested(bank: CompletedViews | None) -> tuple[CompletedViews | None, CompletedViews | None]:
-    """The automatic views of a bank, and those that the viewer or the capture gave; None where there are none."""
-    if bank is None:
-        return None, None
-    asked = [index for index, origin in enumerate(bank.origins) if origin.role in (REQUESTED, BROUGHT)]
-    if not asked:
-        return bank, None
-    other = [index for index in range(len(bank)) if index not in set(asked)]
-    return (bank[other] if other else None), bank[asked]

@@ -106,7 +106,7 @@ def test_generated_frames_are_in_the_bank_and_nowhere_else(capture: Path, tmp_pa
     run_callbacks(manager, attrs)
     photos = {f"photo_{index:03d}" for index in range(PHOTOS)}
     assert names(manager.train_dataset) == photos - {HELD_OUT} and names(manager.eval_dataset) == {HELD_OUT}
-    assert len(manager.cached_train) == len(manager._captured_cameras()) == len(manager._known_parts) == PHOTOS - 1
+    assert len(manager.cached_train) == len(manager.captured_cameras()) == len(manager.known_parts) == PHOTOS - 1
     bank = manager.generated_views
     assert [(one.role, one.round, one.seed, one.model_hash) for one in bank.origins] == [(BROUGHT, 2, 40, "ab"), (BROUGHT, 2, 41, "ab")]
     assert round_title(BROUGHT, 2) == "From the capture" and manager.completion_panel.views is bank
@@ -125,9 +125,9 @@ def test_their_cameras_stand_where_nerfstudio_puts_them(capture: Path):
     manager = make(capture)
     run_callbacks(manager, attributes(manager))
     assert [Path(name).stem for name in stock.image_filenames[:2]] == ["generated_0000", "generated_0001"]
-    assert torch.equal(manager._bank_cameras.camera_to_worlds, stock.cameras.camera_to_worlds[:2])
+    assert torch.equal(manager._bank.cameras.camera_to_worlds, stock.cameras.camera_to_worlds[:2])
     assert torch.equal(manager.train_dataset.cameras.camera_to_worlds, stock.cameras.camera_to_worlds[2:])
-    assert manager._bank_cameras.fx[0].item() == pytest.approx(stock.cameras.fx[0].item())
+    assert manager._bank.cameras.fx[0].item() == pytest.approx(stock.cameras.fx[0].item())
 
 
 def test_what_the_photos_show_is_left_to_them(capture: Path):

@@ -355,7 +355,7 @@ def test_no_camera_is_placed_near_to_what_the_splats_show(tiny_capture: Path, mo
     config = options(at_step=200, anchor_views=12, placement=PlacementConfig(clearance=1.0))
     manager = make(tiny_capture, config, points=False, start_points=0)
     generated(manager, step=200)
-    cameras = manager._captured_cameras()
+    cameras = manager.captured_cameras()
     points = surface_points(ToySplats(), cameras)
     clearance = float(plan_completion(cameras, points, config, size=16).shell.log_radius.median().exp())
 

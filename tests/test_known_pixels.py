@@ -83,8 +83,8 @@ def test_transparent_pixels_teach_nothing_and_are_not_measured(transparent: Path
 
 def test_the_context_of_a_completion_has_holes_where_pictures_are_transparent(transparent: Path):
     manager = make(transparent)
-    (captured,) = manager._captured_cameras()[1:2]
-    view = manager._captured_view(1, captured)
+    (captured,) = manager.captured_cameras()[1:2]
+    view = manager.captured_view(1, captured)
     assert torch.equal(view.known[0] == 0, hole_of())
     fitted = fitted_view(view, 48)
     assert int((fitted.image_known[0, 0, 8:40] == 0).sum()) == 8 * 20

@@ -99,7 +99,7 @@ def test_a_path_is_generated_in_the_splats_world_and_its_margins_are_not_trained
 def test_no_copy_of_a_conditioning_view_is_ever_in_the_bank(tiny_capture: Path):
     manager = make(tiny_capture, options())
     generated(manager)
-    captured = torch.stack([camera.camera_to_world[0] for camera in manager._captured_cameras()])
+    captured = torch.stack([camera.camera_to_world[0] for camera in manager.captured_cameras()])
     distance = (manager.generated_views.cameras.camera_to_world[:, None] - captured[None]).abs().amax(dim=(2, 3))
     assert float(distance.min()) > 1e-3
 

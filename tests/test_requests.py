@@ -449,10 +449,10 @@ class TrackedSplats(ToySplats):
 def test_gaussians_that_only_a_removed_view_saw_go_with_it(tiny_capture: Path, anew: bool):
     manager = make(tiny_capture, options(generated_pixels="all"))
     attrs = generated(manager)
-    bank, cameras, before = manager.generated_views, manager._captured_cameras(), TrackedSplats().means
+    bank, cameras, before = manager.generated_views, manager.captured_cameras(), TrackedSplats().means
     leaving = range(4) if anew else [0]  # all anchors, or one of them
     staying = bank[[index for index in range(6) if index not in leaving]]
-    lone = seen_by_nobody_else(before, bank[leaving], staying, cameras, manager._known_parts)
+    lone = seen_by_nobody_else(before, bank[leaving], staying, cameras, manager.known_parts)
     assert 0 < int(lone.sum()) < 200
     splats = attrs.pipeline.model = TrackedSplats()
     ask_for(manager, RegenerateRound(number=0, seed=3) if anew else RemoveView(key=key_of(bank, 0)))

@@ -1,0 +1,65 @@
+"""How generated views are fitted into a training: colours that meet the splats', masks of what is new, Gaussians where there are none."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.shell import Shell
+from fb_nerfstudio.completed_views import CompletedViews
+from fb_nerfstudio.completion_config import CompletionConfig
+from fb_nerfstudio.unseen import SOLID, coarse, find_unseen, render_geometry, unseen_gaussians, with_matched_colors, with_unseen_masks
+
+
+def fitted_in(
+    views: CompletedViews,
+    splats: Any,
+    optimizers: Optimizers | None,
+    config: CompletionConfig,
+    *,
+    shell: Shell,
+    captured: Sequence[Pinholes],
+    known: Sequence[Bool[Tensor, "_h _w"] | None],
+    trained: bool,
+    holes_only: bool = False,
+) -> tuple[CompletedViews, int]:
+    """Match colours, mask, and place Gaussians for what the capture has not seen.
+
+    Args:
+        views: as they were generated.
+        splats: the model that is trained; Gaussians are added if it can take some.
+        optimizers: its optimizers.
+        config: which of all this is wanted.
+        shell: where the surface is guessed to be.
+        captured: the capture's cameras.
+        known: of each captured picture its known part.
+        trained: whether the splats' depth and opacity are to be believed.
+        holes_only: place Gaussians only where no splats are.
+
+    Returns the views as they are to be trained on, and the number of new Gaussians.
+    """
+    if config.task == "inpaint":  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
+        return views, 0
+    places = config.seed_gaussians and hasattr(splats, "add_gaussians")
+    if not places and config.generated_pixels == "all":
+        return views, 0
+    rendered = render_geometry(splats, coarse(views.cameras)) if trained else None
+    unseen = find_unseen(views, captured, shell, rendered, known)
+    if config.match_colors and rendered is not None:
+        views = with_matched_colors(views, unseen, rendered)
+    if config.generated_pixels == "unseen":
+        views = with_unseen_masks(views, unseen)
+    if not places:
+        return views, 0
+    if holes_only and rendered is not None:
+        unseen = dataclasses.replace(unseen, mask=unseen.mask & (rendered.accumulation < SOLID))
+    generator = torch.Generator().manual_seed(config.seed)
+    points, colors = unseen_gaussians(views, unseen, limit=config.max_seed_gaussians, generator=generator)
+    return views, splats.add_gaussians(points, colors, optimizers) if len(points) else 0
