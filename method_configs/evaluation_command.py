@@ -13,7 +13,7 @@ from method_configs.bench_command import show
 
 @dataclass(frozen=True, kw_only=True)
 class Rooms:
-    """Complete unseen rooms and compare with the nearest known view, the mean colour, and pixels carried over by their depth."""
+    """Complete unseen rooms, from noise and from pixels carried over; compare with these, the nearest known view and the mean colour."""
 
     model: Path | None = None
     """Model folder; by default the bundled one."""
@@ -27,6 +27,8 @@ class Rooms:
     """How varied room and cameras are; the bundled model knows narrow rooms."""
     guidance: tuple[float, ...] = ()
     """Guidance scales of unknown content to try; by default the model's own."""
+    strengths: tuple[float, ...] = (0.6,)
+    """Strengths at which the model also starts from the pixels carried over by direction, instead of from noise; none to leave it out."""
     seed: int = 0
     """Decides rooms, cameras and samples."""
     json: Path | None = None
@@ -41,9 +43,11 @@ class Rooms:
         from rich.progress import track
 
         from fb_core.evaluation.benchmarks import Report
-        from fb_core.evaluation.completion import CompletionTask, RoomResult, evaluate_completion, summary
+        from fb_core.evaluation.completion import CompletionTask, RoomResult, evaluate_completion, started_at, summary
         from fb_core.inpainter import Fillerbuster
 
+        if not all(0 < strength < 1 for strength in self.strengths):
+            raise ValueError(f"strengths: expected times between 0 and 1, got {' '.join(map(str, self.strengths))}")
         completer = Fillerbuster.from_pretrained(self.model)
         task = CompletionTask(rooms=self.rooms, views=self.views, known=self.known, family=self.family, seed=self.seed)
         recommended = completer.recommended_sampling
@@ -51,14 +55,15 @@ class Rooms:
         for scale in self.guidance or (recommended.guidance_unknown,):
             sampling = dataclasses.replace(recommended, guidance_unknown=scale)
             began = time.process_time()
-            iterator = evaluate_completion(completer, task, sampling)
+            iterator = evaluate_completion(completer, task, sampling, strengths=self.strengths)
             results = list(track(iterator, description=f"guidance {scale:g}", total=self.rooms, transient=True))
-            seconds = (time.process_time() - began) / self.rooms
+            seconds = (time.process_time() - began) / self.rooms / (1 + len(self.strengths))
+            times = {"model": 1.0} | {started_at(strength): strength for strength in self.strengths}
+            mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds}
             for method, values in summary(results).items():
-                mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds} if method == "model" else {}
-                blank = {"guidance": "-", "steps": "-", "cpu_seconds_per_room": "-"}
+                own = mine | {"strength": times[method]} if method in times else dict.fromkeys([*mine, "strength"], "-")
                 part = f"{self.rooms} unseen {self.family} rooms, {self.known} of {self.views} views known"
-                report.rows.append({"part": part, "method": method} | values | blank | mine)
+                report.rows.append({"part": part, "method": method} | values | own)
         sheet = self.sheet
         show(report, self.json, [] if sheet is None else [lambda: _draw(sheet, results[:4], self.known, completer)])
 

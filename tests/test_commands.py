@@ -240,7 +240,7 @@ def test_check_runs():
 def test_eval_in_miniature(tmp_path):
     from tiny_models import save_tiny_model
 
-    from fb_core.evaluation.completion import METHODS
+    from fb_core.evaluation.completion import METHODS, started_at
 
     arguments = [
         "--model",
@@ -254,8 +254,11 @@ def test_eval_in_miniature(tmp_path):
         "--guidance",
         "1",
         "2",
+        "--strengths",
+        "0.5",
     ]
     commands.main(["eval", "rooms", *arguments, "--json", str(tmp_path / "eval.json"), "--sheet", str(tmp_path / "sheet.png")])
     rows = json.loads((tmp_path / "eval.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == [*METHODS] * 2 and [row["guidance"] for row in rows[::5]] == [1.0, 2.0]
+    assert [row["method"] for row in rows] == [*METHODS, started_at(0.5)] * 2 and [row["guidance"] for row in rows[::6]] == [1.0, 2.0]
+    assert [row["strength"] for row in rows if row["method"].startswith("model")] == [1.0, 0.5] * 2
     assert (tmp_path / "sheet.png").stat().st_size > 1000

@@ -11,9 +11,11 @@ from fb_core.evaluation.completion import (
     evaluate_completion,
     mean_color,
     nearest_known,
+    started_at,
     summary,
     unseen_room,
 )
+from fb_core.evaluation.image_metrics import psnr
 from fb_core.evaluation.reprojection import inpainted, reproject
 from fb_core.inpainter import SamplingConfig
 
@@ -80,6 +82,19 @@ def test_evaluation_is_reproducible_and_leaves_known_views_alone(tmp_path):
         assert torch.equal(result.completed[:2], result.truth[:2]) and set(result.psnr) == set(METHODS)
     table = summary(first)
     assert table["mean"]["psnr"] == pytest.approx(sum(r.psnr["mean"] for r in first) / 2)
+
+
+def test_a_model_that_starts_from_the_reprojection_stays_near_it_at_small_strength(tmp_path):
+    """At strength 1 it is the model from noise, bit by bit; towards 0 nothing is left to do but the autoencoder's round trip."""
+    model = tiny_model(tmp_path)
+    (result,) = evaluate_completion(model, CompletionTask(rooms=1, views=4, known=2), QUICK, strengths=(1.0, 0.5, 0.01))
+    assert result.psnr[started_at(1.0)] == result.psnr["model"] != result.psnr[started_at(0.5)]
+    room = unseen_room(family="narrow", seed=0, number=0, views=4, size=model.size)
+    start = baselines(room[:2], room[2:].cameras)["reprojected"]
+    with torch.no_grad():
+        returned = model.image_vae.decode(model.image_vae.encode(start))
+    expected = float(psnr(returned.clamp(0, 1), room.images[2:]).mean())
+    assert result.psnr[started_at(0.01)] == pytest.approx(expected, abs=0.3)
 
 
 @pytest.mark.parametrize("nonsense", [{"known": 0}, {"known": 16}, {"rooms": 0}, {"family": "castle"}])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.views import Views
 
 METHODS = ("model", "nearest", "mean", "reprojected", "reprojected by true depth")
+"""What is always compared; beside these the model may start from re-projections (`started_at`)."""
 _FAR = 1e4  # metres; so far away that only the camera's rotation counts
 _FIRST_UNSEEN_ROOM = 10**12  # seeds that no training reaches
 
@@ -53,7 +55,7 @@ class RoomResult:
     completed: Float[Tensor, "n 3 h w"]
     """The same with the unknown views generated."""
     psnr: dict[str, float]
-    """Mean PSNR in dB over the unknown views, per method of `METHODS`."""
+    """Mean PSNR in dB over the unknown views, per method."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,12 +105,26 @@ def baselines(given: RoomViews, hidden: Pinholes) -> dict[str, Float[Tensor, "m 
 
 
 def complete_hidden(
-    model: Fillerbuster, given: RoomViews, hidden: Pinholes, sampling: SamplingConfig, *, seed: int
+    model: Fillerbuster,
+    given: RoomViews,
+    hidden: Pinholes,
+    sampling: SamplingConfig,
+    *,
+    seed: int,
+    start: Float[Tensor, "m 3 h w"] | None = None,
 ) -> Float[Tensor, "m 3 h w"]:
-    """The hidden views as the model generates them in one sequence with the given ones."""
-    views = Views.cat([Views.known(given.images, given.cameras), Views.unknown(hidden)])
-    completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling)
+    """The hidden views as the model generates them in one sequence with the given ones; ``start`` is what it starts from at a strength
+    below 1."""
+    known = Views.known(given.images, given.cameras)
+    views = Views.cat([known, Views.unknown(hidden)])
+    current = None if start is None else Views.cat([known, Views.known(start, hidden)])
+    completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling, current=current)
     return completed.images[len(given.images) :]
+
+
+def started_at(strength: float) -> str:
+    """The name of the model that starts from what is reprojected, noised to that time."""
+    return f"model from reprojected, strength {strength:g}"
 
 
 def evaluate_completion(
@@ -116,15 +132,20 @@ def evaluate_completion(
     task: CompletionTask,
     sampling: SamplingConfig = SamplingConfig(),
     *,
+    strengths: Sequence[float] = (),
     on_room: Callable[[int, int], None] | None = None,
 ) -> Iterable[RoomResult]:
-    """Complete one unseen room after the other; yields each result."""
+    """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result."""
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)
         given, hidden = room[: task.known], room[task.known :]
-        completed = complete_hidden(model, given, hidden.cameras, sampling, seed=task.seed + number)
-        answers = baselines(given, hidden.cameras) | {"model": completed}
-        errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in METHODS}
+        seed, answers = task.seed + number, baselines(given, hidden.cameras)
+        completed = answers["model"] = complete_hidden(model, given, hidden.cameras, sampling, seed=seed)
+        for strength in strengths:
+            later = dataclasses.replace(sampling, strength=strength)
+            start = answers["reprojected"]
+            answers[started_at(strength)] = complete_hidden(model, given, hidden.cameras, later, seed=seed, start=start)
+        errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in (*METHODS, *map(started_at, strengths))}
         yield RoomResult(truth=room.images, completed=torch.cat([given.images, completed]), psnr=errors)
         if on_room is not None:
             on_room(number + 1, task.rooms)
@@ -132,10 +153,7 @@ def evaluate_completion(
 
 def summary(results: list[RoomResult]) -> dict[str, dict[str, float]]:
     """Mean PSNR over rooms and its standard error, per method."""
-    table = {}
-    for method in METHODS:
-        table[method] = mean_psnr([result.psnr[method] for result in results])
-    return table
+    return {method: mean_psnr([result.psnr[method] for result in results]) for method in results[0].psnr}
 
 
 def mean_psnr(values: Sequence[float]) -> dict[str, float]:
