@@ -23,12 +23,12 @@ ROOMS_TINY = Recipe(
     image_vae=VAEConfig(widths=(16, 32, 64, 64), encoder_resnets=1, decoder_resnets=1, norm="none"),
     raymap_vae=VAEConfig(in_channels=6, widths=(8, 16, 32, 32), encoder_resnets=1, decoder_resnets=1, norm="none", padding="replicate"),
     dit=DiTConfig(heads=4, head_dim=64, depth=6, text_width=0),
-    pool=PoolConfig(families=("narrow",), rooms=400, views=20, image_size=64, renewed_per_step=0.5),
+    pool=PoolConfig(families=("narrow",), rooms=400, views=20, image_size=64, renewed_per_step=0.25),
     vae_pool=PoolConfig(families=("narrow",), rooms=120, views=16, image_size=64, renewed_per_step=0.5),
     # Both autoencoders start from a linear codec that is nearly right, which a higher rate would destroy.
     image_vae_loop=LoopConfig(steps=800, learning_rate=4e-4, warmup_steps=100, cooldown=0.5, average=0.98),
-    raymap_vae_loop=LoopConfig(steps=600, learning_rate=1e-4, warmup_steps=100, cooldown=0.5),
-    dit_loop=LoopConfig(steps=4800, learning_rate=7e-4, warmup_steps=100),
+    raymap_vae_loop=LoopConfig(steps=1000, learning_rate=1e-4, warmup_steps=100, cooldown=0.5),
+    dit_loop=LoopConfig(steps=7800, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
     image_vae_loss=VAELossConfig(batch=8),
     raymap_vae_loss=VAELossConfig(batch=16),
     # Heading and fill as at inference: a small model has none to spare for what the canonical frame can settle.

@@ -89,7 +89,7 @@ class LoopConfig:
     save_every: int = 200
     """Steps between checkpoints."""
     optimizer: OptimizerName = "adamw"
-    """adamw, or muon for the matrices of the transformer's blocks (fast on a GPU only)."""
+    """adamw, or muon for the matrices of the transformer's blocks."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.save_every < 1:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from fb_core.training.distributed import spread
+from fb_core.training.muon import Muon
 
 OptimizerName = Literal["adamw", "muon"]
 OPTIMIZERS: tuple[OptimizerName, ...] = get_args(OptimizerName)
@@ -20,8 +21,8 @@ def make_optimizers(
 ) -> list[Optimizer]:
     """The optimisers of a network; vectors (gains, biases) have no weight decay.
 
-    Muon (Jordan et al. 2024) takes the matrices of the transformer's blocks, AdamW all else; Muon's step is scaled to AdamW's usual size,
-    so that one learning rate serves both. Raises ValueError where torch has no Muon.
+    Muon takes the matrices of the transformer's blocks, AdamW all else; Muon's step is scaled to AdamW's usual size, so that one learning
+    rate serves both.
     """
     matrices, vectors, orthogonal = [], [], []
     for parameter_name, parameter in network.named_parameters():
@@ -34,9 +35,7 @@ def make_optimizers(
     groups = [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
     optimizers: list[Optimizer] = [torch.optim.AdamW(groups, lr=learning_rate, betas=betas, foreach=True)]
     if orthogonal:
-        if not hasattr(torch.optim, "Muon"):
-            raise ValueError(f"optimizer: torch {torch.__version__} has no Muon; choose adamw, or torch 2.9 or later")
-        optimizers.append(torch.optim.Muon(orthogonal, lr=learning_rate, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw"))
+        optimizers.append(Muon(orthogonal, learning_rate=learning_rate, weight_decay=weight_decay))
     return optimizers
 
 
