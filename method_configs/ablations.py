@@ -28,7 +28,7 @@ ROOMS_TINY = Recipe(
     # Both autoencoders start from a linear codec that is nearly right, which a higher rate would destroy.
     image_vae_loop=LoopConfig(steps=800, learning_rate=4e-4, warmup_steps=100, cooldown=0.5, average=0.98),
     raymap_vae_loop=LoopConfig(steps=1000, learning_rate=1e-4, warmup_steps=100, cooldown=0.5),
-    dit_loop=LoopConfig(steps=7800, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
+    dit_loop=LoopConfig(steps=6400, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
     image_vae_loss=VAELossConfig(batch=8),
     raymap_vae_loss=VAELossConfig(batch=16),
     # Heading and fill as at inference: a small model has none to spare for what the canonical frame can settle.
