@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fb_core.evaluation.ablations import AblationTask, Distance
+    from fb_core.evaluation.ablations import AblationTask, Asked, Distance
     from fb_core.inpainter import Fillerbuster
     from fb_core.training.recipe import Recipe
 
@@ -45,7 +45,9 @@ class Ablations:
 
     def run(self) -> None:
         """Train what is missing, measure what is missing, report."""
-        from fb_core.evaluation.ablations import AblationTask
+        from functools import cache
+
+        from fb_core.evaluation.ablations import AblationTask, asked_sequences
         from fb_core.evaluation.benchmarks import Report
         from fb_core.inpainter import Fillerbuster
         from method_configs.bench_command import show
@@ -53,11 +55,12 @@ class Ablations:
         task = AblationTask(sequences=self.sequences, lengths=self.lengths, seed=self.seed)
         autoencoders = Fillerbuster.from_pretrained(self.model)
         designs = _designs(self.base, self.steps)
+        asked = cache(lambda: asked_sequences(task, designs["base"].pool.image_size))
         results: dict[tuple[str, int], list[dict[str, float]]] = {}
         for seed in self.seeds:
-            for name, recipe in designs.items():
-                folder = self.output / f"{recipe.name}-{seed}"
-                results[name, seed] = _measured(recipe, seed, folder, autoencoders, task, _distance(self.lpips))
+            folders = {self.output / f"{recipe.name}-{seed}": recipe for recipe in designs.values()}
+            rows = _measured(folders, seed, autoencoders, task, asked, _distance(self.lpips))
+            results.update({(name, seed): rows[folder] for name, folder in zip(designs, folders, strict=True)})
         report = Report(seed=self.seed)
         report.rows.extend(table(results, tuple(designs), self.seeds))
         report.rows.extend(claims(results, self.seeds, trained=designs["base"].dit_loss.task.views))
@@ -87,51 +90,75 @@ def _distance(weights: Path | None) -> Distance | None:
 
 
 def _measured(
-    recipe: Recipe, seed: int, folder: Path, autoencoders: Fillerbuster, task: AblationTask, distance: Distance | None
-) -> list[dict[str, float]]:
-    """One row for each length; kept beside the training with all that decides it."""
+    folders: dict[Path, Recipe],
+    seed: int,
+    autoencoders: Fillerbuster,
+    task: AblationTask,
+    asked: Callable[[], dict[int, list[Asked]]],
+    distance: Distance | None,
+) -> dict[Path, list[dict[str, float]]]:
+    """For each training one row for each length; kept beside the training with all that decides it."""
     import dataclasses
 
     from fb_core.evaluation.ablations import evaluate_design
 
-    asked = dataclasses.asdict(task) | {"steps": recipe.dit_loop.steps, "model": autoencoders.model_hash, "lpips": distance is not None}
-    asked = json_format.loads(json_format.dumps(asked))
-    path = folder / "measured.json"
-    if path.exists() and (kept := json_format.loads(path.read_text()))["asked"] == asked:
-        return kept["rows"]
-    model = _trained(dataclasses.replace(recipe, seed=seed), folder, autoencoders)
-    rows = evaluate_design(model, task, recipe.sampling, distance=distance, on_sequence=_counting(f"{recipe.name}, seed {seed}: sequence"))
-    path.write_text(json_format.dumps({"asked": asked, "rows": rows}, indent=1) + "\n")
-    return rows
+    what = dataclasses.asdict(task) | {"autoencoders": _content_of(autoencoders), "lpips": distance is not None}
+    decides = {folder: json_format.loads(json_format.dumps(what | {"steps": recipe.dit_loop.steps})) for folder, recipe in folders.items()}
+    measured: dict[Path, list[dict[str, float]]] = {}
+    for folder in folders:
+        path = folder / "measured.json"
+        if path.exists() and (kept := json_format.loads(path.read_text()))["asked"] == decides[folder]:
+            measured[folder] = kept["rows"]
+    missing = {folder: dataclasses.replace(recipe, seed=seed) for folder, recipe in folders.items() if folder not in measured}
+    for folder, model in _trained(missing, autoencoders).items():
+        name = f"{folder.name}: sequence"
+        rows = evaluate_design(model, asked(), missing[folder].sampling, times=task.times, distance=distance, on_sequence=_counting(name))
+        (folder / "measured.json").write_text(json_format.dumps({"asked": decides[folder], "rows": rows}, indent=1) + "\n")
+        measured[folder] = rows
+    return measured
 
 
-def _trained(recipe: Recipe, folder: Path, autoencoders: Fillerbuster) -> Fillerbuster:
-    """The design's transformer between the shared autoencoders."""
+def _content_of(autoencoders: Fillerbuster) -> str:
+    """Stands for the weights that all designs share."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for network in (autoencoders.image_vae, autoencoders.raymap_vae):
+        for name, value in network.state_dict().items():
+            digest.update(name.encode() + value.cpu().numpy().tobytes())
+        digest.update(str(network.config).encode())
+    return digest.hexdigest()[:16]
+
+
+def _trained(recipes: dict[Path, Recipe], autoencoders: Fillerbuster) -> dict[Path, Fillerbuster]:
+    """The designs' transformers between the shared autoencoders."""
     import dataclasses
 
     from fb_core.checkpoint import Loaded
     from fb_core.inpainter import Fillerbuster
-    from fb_core.networks.dit import DiT
-    from fb_core.training.loop import Run
-    from fb_core.training.recipe import dit_stage
+    from fb_core.training.side_by_side import train_side_by_side
 
-    task = dit_stage(recipe, autoencoders.image_vae, autoencoders.raymap_vae)
-    run = Run(task, recipe.dit_loop, folder, preset=recipe.name, engine=recipe.engine)
-    count = _counting(f"{recipe.name}, seed {recipe.seed}: step")
-    run.train(on_progress=lambda done, total, _: count(done, total))
-    if run.signal:
-        raise SystemExit(128 + run.signal)
-    transformer = DiT(recipe.dit)
-    transformer.load_state_dict(run.averaged_state())
-    return Fillerbuster(
-        Loaded(
-            dit=transformer,
-            image_vae=autoencoders.image_vae,
-            raymap_vae=autoencoders.raymap_vae,
-            config=dataclasses.replace(autoencoders.config, transformer=recipe.dit),
-            info={"image_size": recipe.pool.image_size},
+    if not recipes:
+        return {}
+    image_vae, raymap_vae = autoencoders.image_vae, autoencoders.raymap_vae
+    trained = train_side_by_side(recipes, image_vae=image_vae, raymap_vae=raymap_vae, on_step=_report_step)
+    return {
+        folder: Fillerbuster(
+            Loaded(
+                dit=transformer,
+                image_vae=image_vae,
+                raymap_vae=raymap_vae,
+                config=dataclasses.replace(autoencoders.config, transformer=transformer.config),
+                info={"image_size": recipes[folder].pool.image_size},
+            )
         )
-    )
+        for folder, transformer in trained.items()
+    }
+
+
+def _report_step(name: str, step: int, steps: int) -> None:
+    if step % max(1, steps // 5) == 0:
+        _logger.info("%s: step %d of %d", name, step, steps)
 
 
 def _counting(what: str, parts: int = 5) -> Callable[[int, int], None]:

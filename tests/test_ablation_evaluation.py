@@ -7,10 +7,11 @@ import pytest
 import torch
 from tiny_models import save_tiny_model, tiny_model
 
-from fb_core.evaluation.ablations import AblationTask, conditional_validation_loss, evaluate_design, interval
+from fb_core.evaluation.ablations import AblationTask, asked_sequences, conditional_validation_loss, evaluate_design, interval
 from fb_core.evaluation.completion import unseen_room
 from fb_core.inpainter import SamplingConfig
 from fb_core.masks import training_mixture
+from fb_core.training import side_by_side
 from method_configs import ablation_evaluation
 from method_configs.ablation_evaluation import Ablations, claims
 
@@ -37,10 +38,11 @@ def test_a_network_that_answers_nothing_has_the_velocity_s_own_size_as_validatio
 
 
 def test_known_views_are_not_scored_and_rows_are_reproducible(tmp_path):
-    model, task = tiny_model(tmp_path), AblationTask(sequences=1, lengths=(4,), times=1)
-    first, again = (evaluate_design(model, task, SamplingConfig(steps=1)) for _ in range(2))
+    model = tiny_model(tmp_path)
+    task = asked_sequences(AblationTask(sequences=1, lengths=(4,)), model.size)
+    first, again = (evaluate_design(model, task, SamplingConfig(steps=1), times=1) for _ in range(2))
     assert first == again and set(first[0]) == {"views", "psnr", "ssim", "val"}
-    with_distance = evaluate_design(model, task, SamplingConfig(steps=1), distance=lambda a, b: torch.tensor([float(len(a))]))
+    with_distance = evaluate_design(model, task, SamplingConfig(steps=1), times=1, distance=lambda a, b: torch.tensor([float(len(a))]))
     assert with_distance[0]["lpips"] == 3
 
 
@@ -67,7 +69,7 @@ def test_designs_are_trained_once_and_measured_once(tmp_path, monkeypatch):
     asked = {"sequences": 1, "lengths": (8,)}
     monkeypatch.setattr(ablation_evaluation, "_designs", _tiny_designs)
     Ablations(**options, **asked, json=tmp_path / "first.json").run()
-    monkeypatch.setattr(ablation_evaluation, "_trained", None)
+    monkeypatch.setattr(side_by_side, "train_side_by_side", None)
     Ablations(**options, **asked, json=tmp_path / "again.json").run()
     first, again = (json.loads((tmp_path / name).read_text())["rows"] for name in ("first.json", "again.json"))
     assert first == again and [row["design"] for row in first if row["part"] == "designs"] == list(DESIGNS)
@@ -85,7 +87,7 @@ def _tiny_designs(base, steps):
     recipe = dataclasses.replace(
         recipe,
         dit=DiTConfig(heads=2, head_dim=16, depth=1, text_width=0),
-        pool=PoolConfig(rooms=2, views=4, image_size=32, supersample=1),
+        pool=PoolConfig(rooms=2, views=4, image_size=32, supersample=1, renewed_per_step=0),
         dit_loop=dataclasses.replace(recipe.dit_loop, steps=steps),
         dit_loss=dataclasses.replace(recipe.dit_loss, batch=2, task=task),
         sampling=SamplingConfig(steps=1),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -47,49 +48,64 @@ class AblationTask:
         require_family(self.family)
 
 
+class Asked(NamedTuple):
+    """One sequence, and what of it is told."""
+
+    room: RoomViews
+    known: Float[Tensor, "n 1 h w"]
+    seed: int
+    """Decides the sample."""
+
+
+def asked_sequences(task: AblationTask, size: int) -> dict[int, list[Asked]]:
+    """The sequences of each length, rendered at this image size."""
+    asked = {}
+    for length in task.lengths:
+        asked[length] = []
+        for number in range(task.sequences):
+            room = unseen_room(family=task.family, seed=task.seed, number=number, views=length, size=size)
+            draw = torch.Generator().manual_seed(task.seed * 1_000_003 + number)
+            known = training_mixture(length, size, size, generator=draw, in_order=True)
+            asked[length].append(Asked(room, known, task.seed + number))
+    return asked
+
+
 def evaluate_design(
     model: Fillerbuster,
-    task: AblationTask,
+    asked: Mapping[int, Sequence[Asked]],
     sampling: SamplingConfig,
     *,
+    times: int = 20,
     distance: Distance | None = None,
     on_sequence: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[dict[str, float]]:
-    """One row for each length: means over sequences of PSNR (dB), SSIM, and the image channels' validation loss; LPIPS with a ``distance``.
+    """One row for each length: means over sequences of PSNR (dB), SSIM, and the image channels' validation loss at ``times`` times;
+    LPIPS with a ``distance``.
 
     Pictures are scored whole, in all views that were not wholly known; what was known of them counts too (as in the paper's code).
     """
-    rows = []
-    for place, length in enumerate(task.lengths):
+    rows, done, total = [], 0, sum(map(len, asked.values()))
+    for length, sequences in asked.items():
         scores = []
-        for number in range(task.sequences):
-            room = unseen_room(family=task.family, seed=task.seed, number=number, views=length, size=model.size)
-            draw = torch.Generator().manual_seed(task.seed * 1_000_003 + number)
-            known = training_mixture(length, model.size, model.size, generator=draw, in_order=True)
-            scores.append(_scores(model, room, known, task, sampling, task.seed + number, distance))
-            on_sequence(place * task.sequences + number + 1, len(task.lengths) * task.sequences)
+        for sequence in sequences:
+            scores.append(_scores(model, sequence, sampling, times, distance))
+            done += 1
+            on_sequence(done, total)
         means = {name: sum(score[name] for score in scores) / len(scores) for name in scores[0]}
         rows.append({"views": length} | means)
     return rows
 
 
-def _scores(
-    model: Fillerbuster,
-    room: RoomViews,
-    known: Float[Tensor, "n 1 h w"],
-    task: AblationTask,
-    sampling: SamplingConfig,
-    seed: int,
-    distance: Distance | None,
-) -> dict[str, float]:
+def _scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: int, distance: Distance | None) -> dict[str, float]:
+    room, known, seed = asked
     views = dataclasses.replace(Views.known(room.images, room.cameras), image_known=known)
     completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling).images
-    asked = (known < 1).flatten(1).any(dim=1)
-    pair = completed[asked], room.images[asked]
+    incomplete = (known < 1).flatten(1).any(dim=1)
+    pair = completed[incomplete], room.images[incomplete]
     scores = {"psnr": float(psnr(*pair).mean()), "ssim": float(ssim(*pair).mean())}
     if distance is not None:
         scores["lpips"] = float(distance(*pair).mean())
-    return scores | {"val": conditional_validation_loss(model, room, known, times=task.times, seed=seed)}
+    return scores | {"val": conditional_validation_loss(model, room, known, times=times, seed=seed)}
 
 
 @torch.no_grad()

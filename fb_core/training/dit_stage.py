@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from einops import rearrange
@@ -59,6 +61,38 @@ class Drawn:
     """Embeddings of the captions, for networks that read text."""
 
 
+class Encoded(NamedTuple):
+    """Rows of a batch as the autoencoders see them, before noise."""
+
+    data: Float[Tensor, "b n 32 h w"]
+    """Clean latents."""
+    conditioning: Conditioning
+    """What the network is told."""
+    image_weight: Float[Tensor, "b n 1 h w"] | None
+    """See `Drawn`."""
+    rays_weight: Float[Tensor, "b n 1 h w"] | None
+    """See `Drawn`."""
+    captions: tuple[str, ...] | None
+    """One text for each sequence; None = the empty one."""
+
+
+class SharedBatches:
+    """Batches that several trainings with the same autoencoders, data and seed share: each is encoded once, the latest are remembered."""
+
+    def __init__(self, keep: int):
+        """``keep``: batches remembered."""
+        self._keep = keep
+        self._batches: OrderedDict[Hashable, Encoded] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], Encoded]) -> Encoded:
+        """The batch of this name, made where it is not remembered."""
+        if key not in self._batches:
+            self._batches[key] = make()
+            if len(self._batches) > self._keep:
+                self._batches.popitem(last=False)
+        return self._batches[key]
+
+
 class DiTStage(Stage):
     """Trains the transformer with frozen autoencoders."""
 
@@ -74,8 +108,12 @@ class DiTStage(Stage):
         config: DiTLossConfig,
         seed: int,
         encode_text: EncodeText | None = None,
+        shared: SharedBatches | None = None,
     ):
-        """Raises ValueError for a network that reads text without ``encode_text`` (``TextEncoder.encode``)."""
+        """``shared`` is for trainings side by side that differ in nothing but the network, the task, and the losses' weights.
+
+        Raises ValueError for a network that reads text without ``encode_text`` (``TextEncoder.encode``).
+        """
         if network.config.text_width and encode_text is None:
             raise ValueError(
                 "dit: this transformer reads text, so training needs a folder with the CLIP text model (a clone of "
@@ -85,6 +123,7 @@ class DiTStage(Stage):
         self.image_vae, self.raymap_vae = (vae.eval().requires_grad_(False) for vae in (image_vae, raymap_vae))
         self.pool, self.config, self.seed = pool, config, seed
         self._encode_text = encode_text if network.config.text_width else None
+        self._shared = shared
         self._empty_prompt: Tensor | None = None
 
     @property
@@ -95,24 +134,34 @@ class DiTStage(Stage):
     @torch.no_grad()
     def draw(self, step: int, rows: range) -> Drawn:
         """Latents of these rows of a step's batch, on their way between data and noise."""
-        self.pool.advance(step, rows)
-        sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
-        data, conditioning = encode_sequences(sequences, image_vae=self.image_vae, raymap_vae=self.raymap_vae)
-        generators = [row_generator(self.seed, step, row, 1) for row in rows]
+        data, conditioning, image_weight, rays_weight, captions = self._encoded(step, rows)
+        noises, positions = ([row_generator(self.seed, step, row, stream) for row in rows] for stream in (1, 2))
         mode, (count, views, *latent) = self.network.config.index, data.shape
         each = count // len(rows)
-        times = torch.cat([logit_normal_times(each, generator=generator) for generator in generators]).to(data.device)
-        noise = torch.cat([torch.randn(each, views, *latent, generator=generator) for generator in generators]).to(data)
-        index = torch.cat([index_positions(mode, each, views, generator=generator) for generator in generators]).to(data.device)
+        times = torch.cat([logit_normal_times(each, generator=generator) for generator in noises]).to(data.device)
+        noise = torch.cat([torch.randn(each, views, *latent, generator=generator) for generator in noises]).to(data)
+        index = torch.cat([index_positions(mode, each, views, generator=generator) for generator in positions]).to(data.device)
         return Drawn(
             inputs=join(at_time(data, noise, times), conditioning),
             times=times,
             index=index,
             velocity=velocity(data, noise),
-            image_weight=_latent_weight(sequences.image_truth),
-            rays_weight=_latent_weight(sequences.rays_truth),
-            text=self._text(sequences.captions, count, data.device),
+            image_weight=image_weight,
+            rays_weight=rays_weight,
+            text=self._text(captions, count, data.device),
         )
+
+    def _encoded(self, step: int, rows: range) -> Encoded:
+        if self._shared is None:
+            return self._encode(step, rows)
+        return self._shared.get((step, rows, self.config.task), lambda: self._encode(step, rows))
+
+    def _encode(self, step: int, rows: range) -> Encoded:
+        self.pool.advance(step, rows)
+        sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
+        data, conditioning = encode_sequences(sequences, image_vae=self.image_vae, raymap_vae=self.raymap_vae)
+        image_weight, rays_weight = (_latent_weight(truth) for truth in (sequences.image_truth, sequences.rays_truth))
+        return Encoded(data, conditioning, image_weight, rays_weight, sequences.captions)
 
     def _text(self, captions: tuple[str, ...] | None, count: int, device: torch.device) -> Float[Tensor, "b words t"] | None:
         if self._encode_text is None:

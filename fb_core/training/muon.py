@@ -39,7 +39,7 @@ class Muon(Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            alike: dict[torch.Size, list[nn.Parameter]] = defaultdict(list)
+            alike: dict[torch.Size, list[Tensor]] = defaultdict(list)
             for matrix in group["params"]:
                 if matrix.grad is not None:
                     alike[matrix.shape].append(matrix)
@@ -50,7 +50,7 @@ class Muon(Optimizer):
                 torch._foreach_add_(matrices, list(directions.unbind()), alpha=-group["lr"] * length)
         return loss
 
-    def _direction(self, matrix: nn.Parameter, momentum: float) -> Float[Tensor, "rows columns"]:
+    def _direction(self, matrix: Tensor, momentum: float) -> Float[Tensor, "rows columns"]:
         """The gradient, mixed with its running mean a step ahead."""
         assert matrix.grad is not None
         state = self.state[matrix]

@@ -23,7 +23,7 @@ from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.sampler import SamplingConfig
 from fb_core.training.distributed import ALONE, Group
-from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText
+from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
 from fb_core.training.linear_start import start_linear
 from fb_core.training.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
 from fb_core.training.perceptual import load_lpips
@@ -137,20 +137,23 @@ def dit_stage(
     device: torch.device | str = "cpu",
     rank: int = 0,
     encode_text: EncodeText | None = None,
+    source: Source | None = None,
+    shared: SharedBatches | None = None,
 ) -> DiTStage:
-    """The transformer with fresh weights between finished autoencoders."""
+    """The transformer with fresh weights between finished autoencoders; ``source`` and ``shared`` where trainings share their data."""
     return DiTStage(
         DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device),
         image_vae=image_vae,
         raymap_vae=raymap_vae,
-        pool=_sequences(recipe, image_vae, device, rank),
+        pool=sequences_of(recipe, image_vae, device, rank) if source is None else source,
         config=recipe.dit_loss,
         seed=recipe.seed,
         encode_text=encode_text,
+        shared=shared,
     )
 
 
-def _sequences(recipe: Recipe, image_vae: VAE, device: torch.device | str, rank: int) -> Source:
+def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "cpu", rank: int = 0) -> Source:
     """The transformer's data: at one size, and at this process's own from some step on."""
     shared: dict[str, Any] = {
         "seed": recipe.seed + 1,
