@@ -44,8 +44,8 @@ ROOMS_ABLATION = dataclasses.replace(
     dit=dataclasses.replace(ROOMS_TINY.dit, heads=2, depth=4),
     # A pool that stays as it is, which designs that take turns can share.
     pool=dataclasses.replace(ROOMS_TINY.pool, rooms=200, views=12, renewed_per_step=0.0),
-    dit_loop=dataclasses.replace(ROOMS_TINY.dit_loop, steps=600, learning_rate=2e-3),
-    sampling=dataclasses.replace(ROOMS_TINY.sampling, steps=8),
+    dit_loop=dataclasses.replace(ROOMS_TINY.dit_loop, steps=400, learning_rate=2e-3),
+    sampling=dataclasses.replace(ROOMS_TINY.sampling, steps=4),
     # The tasks are the paper's, unlike those of rooms-tiny: the designs differ in how raymaps count.
     dit_loss=dataclasses.replace(
         ROOMS_TINY.dit_loss,
