@@ -15,12 +15,14 @@ from torch import Tensor
 from fb_core import checkpoint
 from fb_core.conditioning import LATENT_CHANNELS, decode_in_chunks, encode_in_chunks, encode_known, encode_null, only_known, split, unsplit
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
+from fb_core.masks import to_latent_grid
 from fb_core.memory import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.preview import Progress
 from fb_core.sampling.randomness import noise_of, posterior_generators, random_orders
+from fb_core.sampling.starts import known_latents
 from fb_core.sampling.trajectory import OnStep, SamplingInterrupted
 from fb_core.views import Views
 
@@ -121,8 +123,9 @@ class Fillerbuster:
             on_step: called with (steps done, steps in all).
             on_progress: called after every step with the step, the time reached, and a cheap preview that is made only when asked for.
             prompt: says what is to be seen, for models that read text; None and "" cost nothing.
-            current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1; all
-                of their pixels and rays count, except where `views` knows better.
+            current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1,
+                except where `views` knows better. Latents of which they do not know all pixels start from noise; the others join them
+                at the first time that is not above the strength.
             resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not drawn from.
 
         Raises:
@@ -141,10 +144,15 @@ class Fillerbuster:
         height, width = views.size
         padded = _padded(views.to(self.device))
         frame = _frame_of(padded)
-        started = None
+        started = counts = None
         if current is not None and sampling.strength < 1:
-            started = self._encoded(_padded(current.to(self.device), mode="replicate"), padded, frame, cut)
-        denoising = self._denoising(padded, frame, started, text, seed, sampling, cut)
+            current = _padded(current.to(self.device), mode="replicate")
+            counts = _counting(current, padded)
+            if counts is None:  # they tell nothing that is not known anyway
+                sampling = dataclasses.replace(sampling, strength=1.0)
+            else:
+                started = self._encoded(current, padded, frame, cut)
+        denoising = self._denoising(padded, frame, started, counts, text, seed, sampling, cut)
         look = None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
         try:
             latents = denoising.run(on_step=on_step, on_trajectory=look, resume=None if resume is None else resume.trajectory)
@@ -207,13 +215,14 @@ class Fillerbuster:
         _check(views)
         padded = _padded(views.to(self.device))
         cut = self._cut(len(views), views.size, sampling, None)
-        return self._denoising(padded, _frame_of(padded), None, self._text_of(None), seed, sampling, cut)
+        return self._denoising(padded, _frame_of(padded), None, None, self._text_of(None), seed, sampling, cut)
 
     def _denoising(
         self,
         views: Views,
         frame: CanonicalFrame | None,
         current: Tensor | None,
+        counts: Tensor | None,
         text: Tensor | None,
         seed: int,
         sampling: SamplingConfig,
@@ -244,13 +253,14 @@ class Fillerbuster:
             sampling=sampling,
             text=text,
             current=current,
+            counts=counts,
             branches_at_once=cut.branches,
         )
 
     def _encoded(self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
-        images = only_known(views.images, views.image_known) + (1 - views.image_known) * current.images
-        raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps)
+        images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(current.images, current.image_known)
+        raymaps = torch.where(views.rays_known > 0, views.raymaps, only_known(current.raymaps, current.rays_known))
         raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1)
         return unsplit(
             encode_in_chunks(self.image_vae, images, cut.views_encoded), encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded)
@@ -295,8 +305,16 @@ def _check_current(current: Views, views: Views) -> None:
     if len(current) != len(views) or current.size != views.size:
         expected, got = (f"{len(some)} views of {some.size[1]}x{some.size[0]}" for some in (views, current))
         raise ValueError(f"current: expected {expected} like the views to be completed, got {got}")
-    if not bool(torch.isfinite(current.images).all() & torch.isfinite(current.raymaps).all()):
+    pixels, rays = only_known(current.images, current.image_known), only_known(current.raymaps, current.rays_known)
+    if not bool(torch.isfinite(pixels).all() & torch.isfinite(rays).all()):
         raise ValueError("current: pixels or rays are NaN or infinite; pass whole views, such as an earlier answer of complete")
+
+
+def _counting(current: Views, views: Views) -> Float[Tensor, "n 32 h w"] | None:
+    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones add nothing."""
+    image_known, rays_known = views.image_known.maximum(current.image_known), views.rays_known.maximum(current.rays_known)
+    counts, known = (known_latents(*map(to_latent_grid, k)) for k in ((image_known, rays_known), (views.image_known, views.rays_known)))
+    return None if torch.equal(counts, known) else counts
 
 
 def _padded(views: Views, *, mode: str = "constant") -> Views:

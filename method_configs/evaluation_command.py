@@ -27,7 +27,7 @@ class Rooms:
     """How varied room and cameras are; the bundled model knows narrow rooms."""
     guidance: tuple[float, ...] = ()
     """Guidance scales of unknown content to try; by default the model's own."""
-    strengths: tuple[float, ...] = (0.6,)
+    strengths: tuple[float, ...] = (0.7,)
     """Strengths at which the model also starts from the pixels carried over by direction, instead of from noise; none to leave it out."""
     seed: int = 0
     """Decides rooms, cameras and samples."""

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tiny_models import tiny_model
 
+from fb_core.data.telea import inpainted
 from fb_core.evaluation.completion import (
     METHODS,
     CompletionTask,
@@ -16,7 +17,7 @@ from fb_core.evaluation.completion import (
     unseen_room,
 )
 from fb_core.evaluation.image_metrics import psnr
-from fb_core.evaluation.reprojection import inpainted, reproject
+from fb_core.evaluation.reprojection import reproject
 from fb_core.inpainter import SamplingConfig
 
 TASK = CompletionTask(rooms=2, views=4, known=2)

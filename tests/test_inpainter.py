@@ -8,6 +8,7 @@ from tiny_models import tiny_model
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig, noise_of
+from fb_core.sampler import Point
 from fb_core.views import Views
 
 QUICK = SamplingConfig(steps=2, guidance_unknown=3.0)
@@ -194,6 +195,42 @@ def test_strength_costs_only_the_steps_that_are_left(model):
     sampling = SamplingConfig(steps=10, strength=0.5, shift=1.0)
     model.complete(mixed_views(), generator=seeded(), sampling=sampling, current=current_views(), on_step=lambda *at: seen.append(at))
     assert seen[-1] == (5, 5)
+
+
+def partly_current(views: Views) -> Views:
+    """Of the last view the left half, of all others what is known anyway; loud numbers where nothing is told."""
+    current, told = current_views(), views.image_known.clone()
+    told[-1, ..., :16] = 1
+    return dataclasses.replace(current, images=torch.where(told > 0, current.images, torch.nan), image_known=told)
+
+
+def test_current_views_that_tell_nothing_new_leave_pure_noise_to_the_bit(model):
+    views, sampling = mixed_views(2, 1, 2), dataclasses.replace(QUICK, strength=0.5)
+    current = current_views()
+    loud = torch.where(views.image_known > 0, current.images, torch.nan)
+    nothing = dataclasses.replace(current, images=loud, image_known=views.image_known)
+    wanted = model.complete(views, generator=seeded(), sampling=QUICK)
+    assert torch.equal(model.complete(views, generator=seeded(), sampling=sampling, current=nothing).images, wanted.images)
+    whole = dataclasses.replace(QUICK, strength=1.0)
+    assert torch.equal(model.complete(views, generator=seeded(), sampling=whole, current=partly_current(views)).images, wanted.images)
+
+
+def test_latents_that_count_go_straight_until_the_strength_and_all_others_start_as_noise(model):
+    sampling, generator = SamplingConfig(steps=6, guidance_unknown=3.0), seeded(3)
+    plain = model.denoising(mixed_views(2, 1, 2), seed=0, sampling=sampling)
+    current, counts = torch.randn(5, 32, 4, 4, generator=generator), torch.zeros(5, 32, 4, 4)
+    counts[3, :, :2] = 1
+    started = dataclasses.replace(plain, sampling=dataclasses.replace(sampling, strength=0.4), current=current, counts=counts)
+    points = [Point(state=started.start(), time=1.0)]
+    started.run(on_trajectory=lambda at: points.append(at.point))
+    assert torch.equal(points[0].state, plain.noise) and [point.time for point in points] == sampling.times
+    waiting = [point for point, before in zip(points[1:], points, strict=False) if before.time > 0.4]
+    assert len(waiting) >= 3
+    for point in waiting:
+        straight = (1 - point.time) * current + point.time * plain.noise
+        assert torch.allclose(point.state[3, :, :2], straight[3, :, :2], atol=1e-5)
+        assert not torch.allclose(point.state[3, :, 2:], straight[3, :, 2:], atol=1e-2)
+    assert not torch.allclose(points[-1].state[3, :, :2], current[3, :, :2], atol=1e-2), "the network has moved it since"
 
 
 def test_bad_current_views_are_refused(model):

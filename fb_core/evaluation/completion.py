@@ -13,8 +13,9 @@ from torch import Tensor
 from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, Room, make_room, require_family
+from fb_core.data.telea import inpainted
 from fb_core.evaluation.image_metrics import psnr
-from fb_core.evaluation.reprojection import inpainted, reproject
+from fb_core.evaluation.reprojection import reproject
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.views import Views

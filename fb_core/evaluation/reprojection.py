@@ -1,4 +1,4 @@
-"""A baseline without a network: the known pixels carried to other cameras by their depth, and the holes inpainted by OpenCV."""
+"""A baseline without a network: the known pixels carried to other cameras by their depth."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fb_core.data.telea import telea
 from fb_core.geometry.cameras import Pinholes
 
 _NEAREST = 1.02  # points of one pixel within this factor of the nearest depth are the same surface
-_INPAINT_RADIUS = 3  # pixels
 
 
 def reproject(
@@ -41,12 +39,3 @@ def _draw(pixels: Float[Tensor, "p 2"], depths: Float[Tensor, "p"], colors: Floa
     )
     mean = sums[:, :3] / sums[:, 3:].clamp_min(1)
     return rearrange(mean, "(h w) c -> c h w", h=height), (sums[:, 3] > 0).view(height, width)
-
-
-def inpainted(images: Float[Tensor, "m 3 h w"], known: Bool[Tensor, "m h w"]) -> Float[Tensor, "m 3 h w"]:
-    """The unknown pixels filled from their surroundings; a picture of which nothing is known comes back grey."""
-    filled = [
-        telea(image, mask, radius=_INPAINT_RADIUS) if bool(mask.any()) else torch.full_like(image, 0.5)
-        for image, mask in zip(images, known, strict=True)
-    ]
-    return torch.where(known[:, None], images, torch.stack(filled))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -41,6 +42,9 @@ class Denoising:
     """The empty prompt, and a prompt if there is one; None for a network without text."""
     current: Float[Tensor, "n 32 h w"] | None = None
     """Latents that sampling starts from at a strength below 1."""
+    counts: Float[Tensor, "n 32 h w"] | None = None
+    """1 where these count, 0 where sampling starts from noise all the same; None is 1 everywhere. Not looked at when sampling as the
+    original does."""
     branches_at_once: int | None = None
     """Branches of guidance in one batch; None is all."""
 
@@ -55,9 +59,16 @@ class Denoising:
     ) -> Float[Tensor, "n 32 h w"]:
         """Latents at t = 0."""
         solver = "euler" if self.sampling.reference_compatible else self.sampling.solver
-        return integrate(
-            self.field(), self.start(), self.sampling.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume
-        )
+        return integrate(self.field(), self.start(), self.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume)
+
+    @property
+    def times(self) -> list[float]:
+        """The times of the sampling: from 1 where anything starts from noise."""
+        return dataclasses.replace(self.sampling, strength=1.0).times if self._from_noise_too else self.sampling.times
+
+    @property
+    def _from_noise_too(self) -> bool:
+        return self.counts is not None and not bool(self.counts.all())
 
     def start(self) -> Float[Tensor, "n 32 h w"]:
         """Where the trajectory starts."""
@@ -66,6 +77,8 @@ class Denoising:
             return self.noise
         if sampling.reference_compatible:
             return reference_started(self.current, self.noise, strength=sampling.strength, steps=sampling.steps)
+        if self._from_noise_too:
+            return self.noise
         current = self.current
         if sampling.known == "imposed":
             current = self.conditioning.channels[:, :STATE_CHANNELS].where(wholly_known(self.conditioning) > 0, current)
@@ -83,7 +96,7 @@ class Denoising:
             parts = [*parts, self.conditioning]
         text_scale = sampling.guidance_text if prompted else None
         channels = torch.stack([part.channels for part in parts])
-        prepared = Prepared(self.dit, channels, sampling.times[:-1], text=text, branches_at_once=self.branches_at_once)
+        prepared = Prepared(self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once)
         if sampling.reference_compatible:
             cut = {"window": sampling.window, "rounds": sampling.rounds, "orders": self.orders}
             return reference_field(prepared, scale, text_scale=text_scale, **cut)
@@ -95,4 +108,6 @@ class Denoising:
         field = guided(cut_up(prepared), scale, text_scale=text_scale, variant=variant, unguided=unguided)
         if sampling.known == "imposed":
             field = imposed(field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning))
+        if self.current is not None and self.counts is not None and self._from_noise_too:
+            field = imposed(field, self.current, self.noise, self.counts, until=sampling.strength)
         return field

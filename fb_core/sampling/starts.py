@@ -30,22 +30,31 @@ def reference_started(
 
 def wholly_known(conditioning: Conditioning) -> Float[Tensor, "n 32 h w"]:
     """1 at the latents whose pixels (or rays) are all known, 0 elsewhere."""
-    image, rays = (
-        (known == 1).to(known.dtype).expand(-1, LATENT_CHANNELS, -1, -1) for known in (conditioning.image_known, conditioning.rays_known)
-    )
+    return known_latents(conditioning.image_known, conditioning.rays_known)
+
+
+def known_latents(image_known: Float[Tensor, "n 1 h w"], rays_known: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 32 h w"]:
+    """1 where all of a latent is known, 0 elsewhere; the masks are those of the latent grid."""
+    image, rays = ((known == 1).to(known.dtype).expand(-1, LATENT_CHANNELS, -1, -1) for known in (image_known, rays_known))
     return unsplit(image, rays)
 
 
 def imposed(
-    field: VelocityField, known: Float[Tensor, "n 32 h w"], noise: Float[Tensor, "n 32 h w"], mask: Float[Tensor, "n 32 h w"]
+    field: VelocityField,
+    known: Float[Tensor, "n 32 h w"],
+    noise: Float[Tensor, "n 32 h w"],
+    mask: Float[Tensor, "n 32 h w"],
+    *,
+    until: float = -1.0,
 ) -> VelocityField:
-    """The field with the straight way from the noise to the known latents where the mask is 1.
+    """The field with the straight way from the noise to the known latents where the mask is 1, as long as the time is above ``until``.
 
     Every solver goes straight ways without error, so at each time the network sees the known latents with just the noise of that time.
     """
     straight = noise - known
 
     def field_with_known(state: Tensor, time: float) -> Tensor:
-        return straight.where(mask > 0, field(state, time))
+        velocity = field(state, time)
+        return straight.where(mask > 0, velocity) if time > until else velocity
 
     return field_with_known
