@@ -244,7 +244,7 @@ def _counting() -> Iterator[dict[str, int]]:
     pairs, composited = {"evaluated": 0, "drawn": 0}, torch_compositing._forward_block
 
     def counted(block: torch_compositing.Block, image: Tensor) -> None:
-        pairs["evaluated"] += block.alpha.numel()
+        pairs["evaluated"] += block.weights.numel()
         pairs["drawn"] += int(torch.count_nonzero(block.weights))
         composited(block, image)
 

@@ -1,8 +1,8 @@
-"""Which Gaussian touches which 8x8 cell of which image, exactly and in depth order.
+"""Which Gaussian touches which cell (8 x 4 pixels) of which image, exactly and in depth order.
 
 An ellipse with conic (A, B, C) and opacity o reaches alpha = 1/255 on the curve d^T conic d = q, q = 2 ln(255 o). Its part
 inside a horizontal strip of cells is convex, so it meets exactly the cells between its leftmost and its rightmost point in
-that strip. That needs two square roots a strip and no test per cell: half as many strips as cells, and no row is listed in vain.
+that strip. That needs two square roots a strip and no test per cell: fewer strips than cells, and no row is listed in vain.
 gsplat 1.4 draws a Gaussian only in the 16-pixel tiles that its three-sigma square touches; those limits come in as `bounds`.
 """
 
@@ -14,7 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-CELL = 8
+# Smaller cells hold fewer pixels that a Gaussian leaves alone, but make more rows (Gaussian, cell). Measured: forward and backward
+# take 8 % less time than with 8 x 8 pixels, and 3 % less than with 4 x 8.
+CELL_WIDTH, CELL_HEIGHT = 8, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,16 +28,18 @@ class CellGrid:
     """Image width, pixels."""
     height: int
     """Image height, pixels."""
-    size: int = CELL
-    """Side of a cell, pixels."""
+    cell_width: int = CELL_WIDTH
+    """Width of a cell, pixels."""
+    cell_height: int = CELL_HEIGHT
+    """Height of a cell, pixels."""
 
     @property
     def columns(self) -> int:
-        return -(-self.width // self.size)
+        return -(-self.width // self.cell_width)
 
     @property
     def rows(self) -> int:
-        return -(-self.height // self.size)
+        return -(-self.height // self.cell_height)
 
     @property
     def count(self) -> int:
@@ -43,8 +47,8 @@ class CellGrid:
 
     def centers(self, like: Tensor) -> tuple[Float[Tensor, " cells"], Float[Tensor, " cells"]]:
         """x and y of every cell's centre, pixels."""
-        x = (torch.arange(self.columns, dtype=like.dtype, device=like.device) + 0.5) * self.size
-        y = (torch.arange(self.rows, dtype=like.dtype, device=like.device) + 0.5) * self.size
+        x = (torch.arange(self.columns, dtype=like.dtype, device=like.device) + 0.5) * self.cell_width
+        y = (torch.arange(self.rows, dtype=like.dtype, device=like.device) + 0.5) * self.cell_height
         shape = (self.cameras, self.rows, self.columns)
         return x.expand(shape).reshape(-1), y[:, None].expand(shape).reshape(-1)
 
@@ -96,14 +100,14 @@ class CellLists:
     counts: Int32[Tensor, " cells"]
 
 
-def tile_bounds(x: Tensor, y: Tensor, radius: Tensor, tile_size: int, cell: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def tile_bounds(x: Tensor, y: Tensor, radius: Tensor, tile_size: int, grid: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cells of the tiles that the square box of half size `radius` touches: (first column, last + 1, first row, last + 1)."""
-    scale, per_tile = 1.0 / tile_size, tile_size // cell
+    scale, across, down = 1.0 / tile_size, tile_size // grid.cell_width, tile_size // grid.cell_height
     return (
-        torch.floor((x - radius) * scale).mul_(per_tile),
-        torch.ceil((x + radius) * scale).mul_(per_tile),
-        torch.floor((y - radius) * scale).mul_(per_tile),
-        torch.ceil((y + radius) * scale).mul_(per_tile),
+        torch.floor((x - radius) * scale).mul_(across),
+        torch.ceil((x + radius) * scale).mul_(across),
+        torch.floor((y - radius) * scale).mul_(down),
+        torch.ceil((y + radius) * scale).mul_(down),
     )
 
 
@@ -121,8 +125,8 @@ def measure_strips(ellipses: Ellipses, grid: CellGrid) -> Strips:
     over_A = A.reciprocal()
     half_height = (reach * A * determinant).sqrt_().add_(0.01)
     half_width = (reach * C * determinant).sqrt_().add_(0.01)
-    first, last = _cell_range(ellipses.y - half_height, ellipses.y + half_height, grid.size, grid.rows)
-    left, right = _cell_range(ellipses.x - half_width, ellipses.x + half_width, grid.size, grid.columns)
+    first, last = _cell_range(ellipses.y - half_height, ellipses.y + half_height, grid.cell_height, grid.rows)
+    left, right = _cell_range(ellipses.x - half_width, ellipses.x + half_width, grid.cell_width, grid.columns)
     if ellipses.bounds is not None:
         bound_left, bound_right, bound_top, bound_bottom = ellipses.bounds
         first, last = torch.maximum(first, bound_top), torch.minimum(last, bound_bottom)
@@ -175,8 +179,8 @@ def list_cells(
 
     ranks = torch.arange(number, dtype=torch.int32, device=owner.device)
     row = of(strips.first_row).add_(ranks - first.index_select(0, owner - begin if begin else owner))
-    x, low = of(ellipses.x), (row * grid.size).add_(0.5).sub_(of(ellipses.y))
-    high = low + (grid.size - 1)
+    x, low = of(ellipses.x), (row * grid.cell_height).add_(0.5).sub_(of(ellipses.y))
+    high = low + (grid.cell_height - 1)
     turn, reach, skew, over_A, over_yy = of(strips.turn), of(strips.reach), of(strips.skew), of(strips.over_A), of(strips.over_yy)
 
     def edge(turning: Tensor, side: float) -> Tensor:
@@ -184,7 +188,7 @@ def list_cells(
         half = (y * y).mul_(over_yy).neg_().add_(reach).clamp_(min=0).mul_(over_A).sqrt_().add_(0.01)
         return (skew * y).add_(x).add_(half, alpha=side)
 
-    left, right = _cell_range(edge(-turn, -1.0), edge(turn, 1.0), grid.size, grid.columns)
+    left, right = _cell_range(edge(-turn, -1.0), edge(turn, 1.0), grid.cell_width, grid.columns)
     if ellipses.bounds is not None:
         left, right = torch.maximum(left, of(ellipses.bounds[0])), torch.minimum(right, of(ellipses.bounds[1]))
     base = row.int().mul_(grid.columns).add_(left.int())

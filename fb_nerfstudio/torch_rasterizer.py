@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_nerfstudio.single_thread import single_thread
-from fb_nerfstudio.torch_cells import CELL, CellGrid, Ellipses, tile_bounds
+from fb_nerfstudio.torch_cells import CELL_WIDTH, CellGrid, Ellipses, tile_bounds
 from fb_nerfstudio.torch_compositing import CompositingSettings, composite
 from fb_nerfstudio.torch_projection import ALPHA_MIN, SEMANTICS, Projection, ProjectionSettings, project_splats
 from fb_nerfstudio.torch_spherical_harmonics import MAX_DEGREE, sh_colors
@@ -100,9 +100,8 @@ def rasterization(
             opacities = opacities * projection.compensations
         chosen = _chosen(projection, opacities)
         values = _values(means, colors, viewmats, projection.depths, chosen, sh_degree, render_mode)
-        cell = CELL if tile_size % CELL == 0 else 4
-        grid = CellGrid(cameras=viewmats.shape[0], width=width, height=height, size=cell)
-        ellipses = _ellipses(projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, cell)
+        grid = CellGrid(cameras=viewmats.shape[0], width=width, height=height, cell_width=CELL_WIDTH if tile_size % CELL_WIDTH == 0 else 4)
+        ellipses = _ellipses(projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid)
         compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=absgrad)
         images, alphas = composite(projection.means2d, projection.conics, opacities, values, chosen, ellipses, grid, compositing)
         images = _finish(images, alphas, backgrounds, render_mode)
@@ -159,7 +158,7 @@ def _values(means, colors, viewmats, depths, chosen: Tensor, sh_degree: int | No
     return rows if render_mode == "RGB" else torch.cat([rows, depth], dim=1)
 
 
-def _ellipses(projection: Projection, opacities: Tensor, chosen: Tensor, tile_size: int | None, cell: int) -> Ellipses:
+def _ellipses(projection: Projection, opacities: Tensor, chosen: Tensor, tile_size: int | None, grid: CellGrid) -> Ellipses:
     """The chosen Gaussians as constants, in columns."""
     with torch.no_grad():
         cameras, number = projection.depths.shape
@@ -170,7 +169,7 @@ def _ellipses(projection: Projection, opacities: Tensor, chosen: Tensor, tile_si
 
         x, y = columns(projection.means2d)
         A, B, C = columns(projection.conics)
-        bounds = None if tile_size is None else tile_bounds(x, y, columns(projection.radii)[0].to(x.dtype), tile_size, cell)
+        bounds = None if tile_size is None else tile_bounds(x, y, columns(projection.radii)[0].to(x.dtype), tile_size, grid)
         return Ellipses(
             camera=None if cameras == 1 else torch.div(chosen, number, rounding_mode="floor"),
             x=x,

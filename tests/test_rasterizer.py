@@ -30,8 +30,8 @@ def test_block_and_list_budgets_do_not_change_the_result(monkeypatch):
         return (images, alphas, meta["means2d"].absgrad, *(leaves[name].grad for name in INPUTS))
 
     whole = draw()
-    for pairs, rows in ((2000, 100), (2**15, 400)):
-        small = partial(CompositingSettings, pairs_per_block=pairs, rows_per_list=rows)
+    for pairs, rows, kept in ((2000, 100, 2000), (2**15, 400, 0)):
+        small = partial(CompositingSettings, pairs_per_block=pairs, rows_per_list=rows, kept_pairs=kept)
         monkeypatch.setattr(torch_rasterizer, "CompositingSettings", small)
         for got, expected in zip(draw(), whole, strict=True):
             assert relative(got, expected) < 1e-10
