@@ -5,10 +5,11 @@ Anchors are conditioned on the capture, densified views on the capture and the a
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -57,6 +58,7 @@ class Inpainter(Protocol):
         sampling: SamplingConfig,
         on_step: Callable[[int, int], None] | None,
         prompt: str | None = None,
+        current: Views | None = None,
     ) -> Views: ...
 
 
@@ -79,6 +81,7 @@ def run_completion(
     config: CompletionConfig,
     *,
     done: CompletedViews | None = None,
+    first_guess: Callable[[Pinholes], Views | None] | None = None,
     on_step: Callable[[PlannedRound, int, int], None] | None = None,
     on_found: Callable[[PlannedRound], None] | None = None,
 ) -> Iterator[CompletedViews]:
@@ -94,6 +97,7 @@ def run_completion(
         model: the diffusion model.
         config: sampling options.
         done: views of rounds that an interrupted run has generated; these rounds are skipped.
+        first_guess: gives what new cameras see as far as that is known; generation starts from there at ``config.strength``.
         on_step: called with (round, denoising steps done, steps in all).
         on_found: called with a round that is loaded from the cache.
 
@@ -109,7 +113,9 @@ def run_completion(
         captured = fitted[list(plan.context_of(planned))]
         known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
-        images = round_images(sequence, planned, model, config, cache, on_step, on_found)
+        guess = None if first_guess is None or config.strength == 1 else first_guess(planned.cameras)
+        current = None if guess is None else Views.cat([*known, guess])
+        images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
         origin = Origin(
             role=planned.role,
             round=planned.number,
@@ -142,21 +148,27 @@ def round_images(
     cache: CompletionCache | None,
     on_step: Callable[[PlannedRound, int, int], None] | None,
     on_found: Callable[[PlannedRound], None] | None,
+    current: Views | None = None,
 ) -> UInt8[Tensor, "n h w 3"]:
-    """Pictures of the sequence's last views, those of the round: from the cache, or generated and kept there."""
+    """Pictures of the sequence's last views, those of the round: from the cache, or generated (from ``current``) and kept there."""
     sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
-    key = "" if cache is None else round_key(sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt)
+    if current is not None:
+        sampling = dataclasses.replace(sampling, strength=config.strength)
+    key = ""
+    if cache is not None:
+        key = round_key(sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt, current=current)
     found = None if cache is None else cache.find(key, views=views, size=sequence.size[0])
     if found is not None:
         if on_found is not None:
             on_found(planned)
         return found
+    optional: dict[str, Any] = ({"prompt": prompt} if prompt else {}) | ({} if current is None else {"current": current})
     filled = model.complete(
         sequence,
         generator=torch.Generator().manual_seed(planned.seed),
         sampling=sampling,
         on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
-        **({"prompt": prompt} if prompt else {}),
+        **optional,
     )
     new = filled[list(range(len(sequence) - views, len(sequence)))]
     images = (new.images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()

@@ -34,7 +34,9 @@ _IMAGES = "images"
 _logger = logging.getLogger(__name__)
 
 
-def round_key(sequence: Views, *, seed: int, sampling: SamplingConfig, model_hash: str, prompt: str = "") -> str:
+def round_key(
+    sequence: Views, *, seed: int, sampling: SamplingConfig, model_hash: str, prompt: str = "", current: Views | None = None
+) -> str:
     """64 hexadecimal digits that are the same exactly when all that decides a round's pictures is.
 
     Args:
@@ -43,6 +45,7 @@ def round_key(sequence: Views, *, seed: int, sampling: SamplingConfig, model_has
         sampling: options; how the work is cut into pieces does not count.
         model_hash: content hash of the weights.
         prompt: text of the round.
+        current: views that sampling starts from, if it does; what they do not know does not count.
     """
     options = {name: value for name, value in dataclasses.asdict(sampling).items() if name not in _ONLY_HOW}
     told = {
@@ -54,8 +57,9 @@ def round_key(sequence: Views, *, seed: int, sampling: SamplingConfig, model_has
         "shape": [*sequence.images.shape],
     }
     digest = hashlib.sha256(json.dumps(told, sort_keys=True, allow_nan=False).encode())
-    for part in _canonical_bytes(sequence):
-        digest.update(part)
+    for views in [sequence] if current is None else [sequence, current]:
+        for part in _canonical_bytes(views):
+            digest.update(part)
     return digest.hexdigest()
 
 

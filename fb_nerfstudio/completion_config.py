@@ -89,6 +89,11 @@ class CompletionConfig:
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says nothing)."""
     guidance_known: float | None = None
     """Guidance scale in known pixels; None is what the model's folder recommends (the paper's 1.1 where it says nothing)."""
+    start: Literal["noise", "render"] = "render"
+    """Start generation from noise alone, or, where the splats are opaque (trained for 100 steps at least), from their render noised to the
+    time `strength`. What is asked for in the viewer starts from noise: the splats show what it is to replace."""
+    strength: float = 0.5
+    """Time from which on the render may change (``start`` render): towards 0 it stays as it is, 1 is noise."""
     window: int | None = None
     """Views denoised together, averaged over random windows, for sequences longer than the model likes; None is all of them."""
     memory_budget: float | None = None
@@ -138,6 +143,8 @@ class CompletionConfig:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         if not 0.0 <= self.generated_share <= 1.0:
             raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
+        if not 0.0 < self.strength <= 1.0:
+            raise ValueError(f"completion.strength: expected a time above 0 and at most 1, got {self.strength}")
         if self.memory_budget is not None and not self.memory_budget > 0:
             raise ValueError(f"completion.memory_budget: expected a positive number of GiB, got {self.memory_budget}")
         if self.view_weight < 0:

@@ -7,7 +7,7 @@ import logging
 import shutil
 import time
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from fb_nerfstudio.completion import Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.first_guess import first_guess
 from fb_nerfstudio.fitting_in import fitted_in
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
 from fb_nerfstudio.grid_inpainter import GridInpainter
@@ -198,7 +199,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         model, cameras = self._load_inpainter(), self.captured_cameras()
         points = self._seen_points(splats, cameras, step)
         inpaints, size = config.task == "inpaint", config.image_size or model.size
-        generate = run_inpainting if inpaints else run_completion
+        renders = config.start == "render" and step >= TRAINED_STEPS
+        guess = partial(first_guess, splats) if renders else None
+        generate = run_inpainting if inpaints else partial(run_completion, first_guess=guess)
         if inpaints:
             plan = plan_inpainting(cameras, points, config, size=size)
         else:

@@ -72,6 +72,7 @@ class GridInpainter:
         sampling: SamplingConfig,
         on_step: Callable[[int, int], None] | None = None,
         prompt: str | None = None,
+        current: Views | None = None,
     ) -> Views:
         """Fill all unknown pixels; known ones are returned as given. Rays are taken as known, for nothing here looks at them.
 
@@ -82,6 +83,7 @@ class GridInpainter:
             sampling: ``steps`` and ``guidance_unknown`` go to diffusers.
             on_step: called with (grids done, grids in all).
             prompt: for pipelines that read text.
+            current: not looked at; 2D inpainters start from noise.
         """
         images = torch.where(views.image_known > 0, views.images, torch.zeros_like(views.images)).cpu().float()
         known = views.image_known.cpu().float().clone()

@@ -57,8 +57,9 @@ class LazyInpainter:
         sampling: SamplingConfig,
         on_step: Callable[[int, int], None] | None,
         prompt: str | None = None,
+        current: Views | None = None,
     ) -> Views:
         """``Fillerbuster.complete``; the first call loads the weights. Raises ValueError when they are broken."""
         if self._model is None:
             self._model = Fillerbuster.from_pretrained(self._folder, device=self._device, text_encoder=self._text_encoder)
-        return self._model.complete(views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt)
+        return self._model.complete(views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt, current=current)

@@ -26,7 +26,9 @@ from fb_nerfstudio.seams import without_seams
 
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
-_FIRM = 0.75  # accumulation from which splats beside the captured pictures are believed
+FIRM = 0.75
+"""Accumulation from which the splats' colours are believed beside the captured pictures, and as a start of generation. (A room at step 500:
+14 dB from 0.5 on, which generated views exceed, 19 dB from 0.75 on, 27 dB from 0.95 on.)"""
 _OPAQUE = 0.95  # accumulation from which a render's colour is that of the splats, without the background
 _BESIDE = 0.5  # how far beside, as a part of the picture's side
 TRAINED_STEPS = 100
@@ -139,7 +141,7 @@ def find_unseen(
     if rendered is not None:
         wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
         beside = seen_by([_widened(camera) for camera in nearby], finite, wider).reshape(covered.shape)
-        inside |= beside & (rendered.accumulation >= _FIRM)
+        inside |= beside & (rendered.accumulation >= FIRM)
     return Unseen(mask=~(covered & inside), points=points)
 
 

@@ -14,7 +14,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -58,6 +58,8 @@ class Methods:
     """Cut the middle out of every picture, or, as people's masks do, one cube of the room out of the pictures that show it."""
     model: Path | None = None
     """Model folder; by default the bundled one."""
+    completion: dict[str, str] = field(default_factory=dict)
+    """Further options of every method's completion, as names and values (start render strength 0.7)."""
     output: Path = Path("outputs/methods")
     """Folder for captures and runs. Runs that are there already are not trained again."""
     json: Path | None = None
@@ -177,6 +179,7 @@ def arguments_of(method: str, folder: Path, room: int, config: Methods) -> list[
         completion["model"] = config.model.absolute()
     if config.quick:
         completion |= {"steps": 2, "anchor-views": min(own.anchor_views, 2), "densify-rounds": 1, "densify-views": 2}
+    completion |= config.completion
     shared = training_arguments(folder.absolute(), "fillerbuster-none", seed=room, iterations=config.iterations, model=None)
     extra = (text for name, value in completion.items() for text in (f"--pipeline.datamanager.completion.{name}", str(value)))
     return [method, *shared[1:], *extra]

@@ -65,6 +65,17 @@ def test_a_key_is_the_same_everywhere():
     assert round_key(views, sampling=SAMPLING, **options) == hashlib.sha256(b"".join(parts)).hexdigest()
 
 
+def test_what_sampling_starts_from_counts_as_far_as_it_is_told():
+    views, half = sequence(), dataclasses.replace(SAMPLING, strength=0.5)
+    told = views.image_known.clone()
+    told[4, ..., :4] = 1
+    start = dataclasses.replace(views, images=torch.full_like(views.images, 0.25), image_known=told)
+    louder = dataclasses.replace(start, images=torch.where(told > 0, start.images, math.nan))
+    brighter = dataclasses.replace(start, images=start.images + 0.25)
+    keys = [key(), key(sampling=half, current=start), key(sampling=half, current=brighter), key(sampling=SAMPLING, current=start)]
+    assert len(set(keys)) == 4 and key(sampling=half, current=louder) == keys[1]
+
+
 def test_what_stands_in_unknown_pixels_and_how_tensors_lie_in_memory_do_not_count():
     views = sequence()
     noisy = dataclasses.replace(views, images=torch.where(views.image_known > 0, views.images, math.nan))

@@ -80,13 +80,14 @@ def test_pixels_that_look_at_a_cube():
 @pytest.mark.parametrize("method", dict.fromkeys([*NEW_VIEWS, *MASKED]))
 @pytest.mark.parametrize("quick", [False, True])
 def test_nerfstudio_accepts_what_each_run_is_asked_for(method: str, quick: bool, tmp_path: Path):
-    config = Methods(quick=quick, iterations=90)
+    config = Methods(quick=quick, iterations=90, completion={"start": "render", "strength": "0.75"})
     own = getattr(splats, method.replace("-", "_")).config
     name, *arguments = arguments_of(method, tmp_path, 3, config)
     dataparser = arguments.index("--data")  # ns-train's own option, which the bare config has too
     assert name == method and arguments[dataparser + 1] == str(tmp_path / "capture")
     parsed = tyro.cli(tyro.conf.FlagConversionOff[TrainerConfig], default=own, args=arguments)
     completion, before = parsed.pipeline.datamanager.completion, own.pipeline.datamanager.completion
+    assert (completion.start, completion.strength) == ("render", 0.75)
     assert completion.seed == 3 and completion.at_step == min(before.at_step, 30) and completion.task == before.task
     assert quick or (completion.anchor_views, completion.densify_rounds) == (before.anchor_views, before.densify_rounds)
     assert parsed.max_num_iterations == 90 and parsed.experiment_name == "room"
