@@ -29,6 +29,8 @@ class Rooms:
     """Guidance scales of unknown content to try; by default the model's own."""
     strengths: tuple[float, ...] = (0.7,)
     """Strengths at which the model also starts from the pixels carried over by direction, instead of from noise; none to leave it out."""
+    samples: int = 4
+    """Samples whose mean is scored, too; 1 to leave it out."""
     seed: int = 0
     """Decides rooms, cameras and samples."""
     json: Path | None = None
@@ -43,11 +45,13 @@ class Rooms:
         from rich.progress import track
 
         from fb_core.evaluation.benchmarks import Report
-        from fb_core.evaluation.completion import CompletionTask, RoomResult, evaluate_completion, started_at, summary
+        from fb_core.evaluation.completion import CompletionTask, RoomResult, evaluate_completion, mean_of, started_at, summary
         from fb_core.inpainter import Fillerbuster
 
         if not all(0 < strength < 1 for strength in self.strengths):
             raise ValueError(f"strengths: expected times between 0 and 1, got {' '.join(map(str, self.strengths))}")
+        if self.samples < 1:
+            raise ValueError(f"samples: expected at least 1, got {self.samples}")
         completer = Fillerbuster.from_pretrained(self.model)
         task = CompletionTask(rooms=self.rooms, views=self.views, known=self.known, family=self.family, seed=self.seed)
         recommended = completer.recommended_sampling
@@ -55,10 +59,10 @@ class Rooms:
         for scale in self.guidance or (recommended.guidance_unknown,):
             sampling = dataclasses.replace(recommended, guidance_unknown=scale)
             began = time.process_time()
-            iterator = evaluate_completion(completer, task, sampling, strengths=self.strengths)
+            iterator = evaluate_completion(completer, task, sampling, strengths=self.strengths, samples=self.samples)
             results = list(track(iterator, description=f"guidance {scale:g}", total=self.rooms, transient=True))
-            seconds = (time.process_time() - began) / self.rooms / (1 + len(self.strengths))
-            times = {"model": 1.0} | {started_at(strength): strength for strength in self.strengths}
+            seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths))
+            times = {"model": 1.0, mean_of(self.samples): 1.0} | {started_at(strength): strength for strength in self.strengths}
             mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds}
             for method, values in summary(results).items():
                 own = mine | {"strength": times[method]} if method in times else dict.fromkeys([*mine, "strength"], "-")

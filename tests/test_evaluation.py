@@ -8,9 +8,11 @@ from fb_core.data.telea import inpainted
 from fb_core.evaluation.completion import (
     METHODS,
     CompletionTask,
+    RoomResult,
     baselines,
     evaluate_completion,
     mean_color,
+    mean_of,
     nearest_known,
     started_at,
     summary,
@@ -102,3 +104,21 @@ def test_a_model_that_starts_from_the_reprojection_stays_near_it_at_small_streng
 def test_nonsense_tasks_are_refused(nonsense):
     with pytest.raises(ValueError, match="expected"):
         CompletionTask(**nonsense)
+
+
+def test_the_mean_of_samples_is_scored_and_a_single_one_is_left_alone(tmp_path):
+    model = tiny_model(tmp_path)
+    (alone,), (result,) = (evaluate_completion(model, CompletionTask(rooms=1, views=4, known=2), QUICK, samples=count) for count in (1, 3))
+    assert result.psnr["model"] == alone.psnr["model"]
+    assert mean_of(3) in result.psnr and mean_of(3) not in alone.psnr
+    assert result.psnr[mean_of(3)] > result.psnr["model"]  # independent errors cancel
+
+
+def test_what_is_above_the_baseline_is_told_room_by_room():
+    pictures = torch.zeros(1, 3, 4, 4)
+    results = [
+        RoomResult(truth=pictures, completed=pictures, psnr={"model": base + 0.5, "reprojected": base}) for base in (10.0, 20.0, 30.0)
+    ]
+    rows = summary(results)
+    assert rows["model"]["above_psnr"] == pytest.approx(0.5) and rows["model"]["above_standard_error"] == pytest.approx(0)
+    assert rows["model"]["standard_error"] > 1 and rows["reprojected"]["above_psnr"] == 0

@@ -24,6 +24,7 @@ METHODS = ("model", "nearest", "mean", "reprojected", "reprojected by true depth
 """What is always compared; beside these the model may start from re-projections (`started_at`)."""
 _FAR = 1e4  # metres; so far away that only the camera's rotation counts
 _FIRST_UNSEEN_ROOM = 10**12  # seeds that no training reaches
+_OTHER_SAMPLE = 10**6  # between the seeds of one room's samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,15 +129,25 @@ def started_at(strength: float) -> str:
     return f"model from reprojected, strength {strength:g}"
 
 
+def mean_of(samples: int) -> str:
+    """The name of the mean of several samples: what one expects to see, blurred where the model is unsure."""
+    return f"mean of {samples} samples"
+
+
 def evaluate_completion(
     model: Fillerbuster,
     task: CompletionTask,
     sampling: SamplingConfig = SamplingConfig(),
     *,
     strengths: Sequence[float] = (),
+    samples: int = 1,
     on_room: Callable[[int, int], None] | None = None,
 ) -> Iterable[RoomResult]:
-    """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result."""
+    """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result.
+
+    With several ``samples`` their mean is scored, too.
+    """
+    averaged = (mean_of(samples),) if samples > 1 else ()
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)
         given, hidden = room[: task.known], room[task.known :]
@@ -146,15 +157,27 @@ def evaluate_completion(
             later = dataclasses.replace(sampling, strength=strength)
             start = answers["reprojected"]
             answers[started_at(strength)] = complete_hidden(model, given, hidden.cameras, later, seed=seed, start=start)
-        errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in (*METHODS, *map(started_at, strengths))}
+        if averaged:
+            others = [_OTHER_SAMPLE * other + seed for other in range(1, samples)]
+            drawn = [completed, *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others)]
+            answers[mean_of(samples)] = torch.stack(drawn).mean(dim=0)
+        methods = (*METHODS, *map(started_at, strengths), *averaged)
+        errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in methods}
         yield RoomResult(truth=room.images, completed=torch.cat([given.images, completed]), psnr=errors)
         if on_room is not None:
             on_room(number + 1, task.rooms)
 
 
 def summary(results: list[RoomResult]) -> dict[str, dict[str, float]]:
-    """Mean PSNR over rooms and its standard error, per method."""
-    return {method: mean_psnr([result.psnr[method] for result in results]) for method in results[0].psnr}
+    """Mean PSNR over rooms, and how far that is above the pixels carried over by direction, with standard errors, per method.
+
+    The second is the mean of differences room by room, which is far surer than the difference of the means.
+    """
+    rows = {}
+    for method in results[0].psnr:
+        above = mean_psnr([result.psnr[method] - result.psnr["reprojected"] for result in results])
+        rows[method] = mean_psnr([result.psnr[method] for result in results]) | {f"above_{name}": value for name, value in above.items()}
+    return rows
 
 
 def mean_psnr(values: Sequence[float]) -> dict[str, float]:

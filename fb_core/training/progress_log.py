@@ -1,4 +1,4 @@
-"""What a training leaves to read: ``log.jsonl`` with all losses, ``validation.jsonl``, ``loss.png``, and TensorBoard's files on demand."""
+"""What a training leaves to read: its losses, what unseen data say (both as JSON lines and as a curve), TensorBoard's files on demand."""
 
 from __future__ import annotations
 
@@ -39,19 +39,20 @@ class ProgressLog:
                 self._board.add_scalar(f"validation/{name}", value, step)
 
     def close(self) -> None:
-        """Draw the curve of all losses."""
+        """Draw the curves of all losses and of what unseen data say."""
         if self._board is not None:
             self._board.flush()
-        if self._path.exists():
-            self._draw([json.loads(line) for line in self._path.read_text().splitlines()])
+        for path, name in ((self._path, "loss.png"), (self._validation, "validation.png")):
+            if path.exists():
+                self._draw([json.loads(line) for line in path.read_text().splitlines()], name)
 
-    def _draw(self, rows: list[dict[str, float]]) -> None:
+    def _draw(self, rows: list[dict[str, float]], file: str) -> None:
         if len(rows) < 2:
             return
         try:
             import matplotlib
         except ImportError:
-            _logger.info("%s: no loss.png, because matplotlib is not installed; log.jsonl has the numbers", self.title)
+            _logger.info("%s: no %s, because matplotlib is not installed; its numbers are in a file beside it", self.title, file)
             return
         matplotlib.use("Agg")
         from matplotlib import pyplot
@@ -63,9 +64,9 @@ class ProgressLog:
                 values = [row[name] for row in rows]
                 means = [sum(values[k : k + width]) / len(values[k : k + width]) for k in range(0, len(values), width)]
                 axes.plot([rows[k]["step"] for k in range(0, len(rows), width)], means, label=name)
-        axes.set(xlabel="step", ylabel="loss", yscale="log", title=self.title)
+        axes.set(xlabel="step", ylabel=file.removesuffix(".png"), yscale="log", title=self.title)
         axes.legend()
-        figure.savefig(self.folder / "loss.png", dpi=120)
+        figure.savefig(self.folder / file, dpi=120)
         pyplot.close(figure)
 
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +22,9 @@ from fb_core.masks import training_mixture
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.training.loop import OnSheet
+
+if TYPE_CHECKING:
+    from fb_core.evaluation.completion import RoomViews
 
 _logger = logging.getLogger(__name__)
 _DPI = 80
@@ -44,14 +48,20 @@ def room_sheet(
     The number is ``val``, the validation loss of the paper's table 2, over four unseen rooms.
     """
 
+    @cache
+    def unseen_rooms() -> list[RoomViews]:
+        from fb_core.evaluation.completion import unseen_room
+
+        return [unseen_room(family=family, seed=0, number=number, views=views, size=size) for number in range(_VALIDATED_ROOMS)]
+
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
         from fb_core.evaluation.ablations import conditional_validation_loss
-        from fb_core.evaluation.completion import complete_hidden, unseen_room
+        from fb_core.evaluation.completion import complete_hidden
 
         architecture = ModelConfig(transformer=config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
         dit = _with_weights(DiT(config), state, device)
         model = Fillerbuster(Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=architecture))
-        rooms = [unseen_room(family=family, seed=0, number=number, views=views, size=size) for number in range(_VALIDATED_ROOMS)]
+        rooms = unseen_rooms()
         masks = training_mixture(views, size, size, generator=torch.Generator().manual_seed(0), in_order=True)
         losses = [conditional_validation_loss(model, each, masks, seed=number) for number, each in enumerate(rooms)]
         room, known = rooms[0], max(1, views // 2)
