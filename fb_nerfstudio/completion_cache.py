@@ -1,8 +1,8 @@
 """Generated rounds kept by what decided them, so that the same inputs, seed and weights never generate twice.
 
 A round's key is a SHA-256 over everything that decides its pictures: the sequence the model was given (known pixels, masks, rays
-of the planned cameras among them), what sampling starts from, the seed, the prompt, the sampling options and the content hash of the weights. The key names one
-file below the cache folder, which appears whole or not at all; any number of runs may share the folder.
+of the planned cameras among them), what sampling starts from, the seed, the prompt, the sampling options and the content hash of the
+weights. The key names one file below the cache folder, which appears whole or not at all; any number of runs may share the folder.
 """
 
 from __future__ import annotations
