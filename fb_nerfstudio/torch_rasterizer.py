@@ -112,9 +112,7 @@ def _usable(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacitie
     """Which Gaussians have finite values only (None = all of them), and how many have not."""
     with torch.no_grad():
         given = [t for t in (means, quats, scales, covars) if t is not None]
-        total = sum((t.flatten(1).sum(dim=1) for t in given), opacities)
-        finite = total.isfinite()
-        if bool(finite.all()):
+        if bool(torch.stack([t.sum() for t in (*given, opacities)]).isfinite().all()):  # the quickest look at all of them
             return None, 0
         finite = opacities.isfinite()
         for tensor in given:
