@@ -36,7 +36,7 @@ ROOMS_TINY = Recipe(
     sampling=SamplingConfig(steps=16, guidance_unknown=1.0, guidance_known=1.0),
     dit_loss=DiTLossConfig(batch=8, task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False), ray_weight=0.3),
 )
-"""The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about two and a half hours."""
+"""The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about four hours."""
 
 ROOMS_ABLATION = dataclasses.replace(
     ROOMS_TINY,
