@@ -187,7 +187,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         with refusing():
             views = brought_views(frames, number=number, size=None if bank is None else bank.cameras.width)
         scene = self._scene(splats_of(attributes), cameras, step, size=views.cameras.width)
-        views, added = self._fitted_in(views, attributes, scene.shell, step)
+        views, added = self._fitted_in(views, attributes, scene.shell, cameras, step)
         self._set_bank(merged(bank, (), views))
         self._save_bank(attributes.trainer)
         CONSOLE.print(f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen regions.")
@@ -223,7 +223,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         release_memory()
         done, requested = without_requested(self.generated_views)
         if done is not None:
-            done, added = self._fitted_in(done, attributes, plan.shell, step)
+            done, added = self._fitted_in(done, attributes, plan.shell, cameras, step)
             self._set_bank(done if requested is None else CompletedViews.cat([done, requested]))
             folder = self._save_bank(trainer)
             where = "" if folder is None else f", saved in {folder}"
@@ -296,7 +296,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         release_memory()
         if self.generated_views is not None and planned.replaces:
             self._forget(self.generated_views[planned.replaces], planned.done, cameras, attributes)
-        new, added = self._fitted_in(new, attributes, scene.shell, step, holes_only=True)
+        new, added = self._fitted_in(new, attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
         said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
@@ -333,7 +333,13 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         return torch.cat(groups) if groups else None
 
     def _fitted_in(
-        self, views: CompletedViews, attributes: TrainingCallbackAttributes, shell: Shell, step: int, holes_only: bool = False
+        self,
+        views: CompletedViews,
+        attributes: TrainingCallbackAttributes,
+        shell: Shell,
+        cameras: list[Pinholes],
+        step: int,
+        holes_only: bool = False,
     ) -> tuple[CompletedViews, int]:
         """The views as they are to be trained on, and how many Gaussians were added for them."""
         return fitted_in(
@@ -342,7 +348,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             attributes.optimizers,
             self.config.completion,
             shell=shell,
-            captured=self.captured_cameras(),
+            captured=cameras,
             known=self.known_parts,
             trained=step >= TRAINED_STEPS,
             holes_only=holes_only,

@@ -6,6 +6,7 @@ import json as json_format
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +46,6 @@ class Ablations:
 
     def run(self) -> None:
         """Train what is missing, measure what is missing, report."""
-        from functools import cache
-
         from fb_core.evaluation.ablations import AblationTask, asked_sequences
         from fb_core.evaluation.benchmarks import Report
         from fb_core.inpainter import Fillerbuster
@@ -111,8 +110,8 @@ def _measured(
             measured[folder] = kept["rows"]
     missing = {folder: dataclasses.replace(recipe, seed=seed) for folder, recipe in folders.items() if folder not in measured}
     for folder, model in _trained(missing, autoencoders).items():
-        name = f"{folder.name}: sequence"
-        rows = evaluate_design(model, asked(), missing[folder].sampling, times=task.times, distance=distance, on_sequence=_counting(name))
+        count = partial(_count, f"{folder.name}: sequence")
+        rows = evaluate_design(model, asked(), missing[folder].sampling, times=task.times, distance=distance, on_sequence=count)
         (folder / "measured.json").write_text(json_format.dumps({"asked": decides[folder], "rows": rows}, indent=1) + "\n")
         measured[folder] = rows
     return measured
@@ -141,7 +140,9 @@ def _trained(recipes: dict[Path, Recipe], autoencoders: Fillerbuster) -> dict[Pa
     if not recipes:
         return {}
     image_vae, raymap_vae = autoencoders.image_vae, autoencoders.raymap_vae
-    trained = train_side_by_side(recipes, image_vae=image_vae, raymap_vae=raymap_vae, on_step=_report_step)
+    trained = train_side_by_side(
+        recipes, image_vae=image_vae, raymap_vae=raymap_vae, on_step=lambda name, step, steps: _count(f"{name}: step", step, steps)
+    )
     return {
         folder: Fillerbuster(
             Loaded(
@@ -156,17 +157,10 @@ def _trained(recipes: dict[Path, Recipe], autoencoders: Fillerbuster) -> dict[Pa
     }
 
 
-def _report_step(name: str, step: int, steps: int) -> None:
-    if step % max(1, steps // 5) == 0:
-        _logger.info("%s: step %d of %d", name, step, steps)
-
-
-def _counting(what: str, parts: int = 5) -> Callable[[int, int], None]:
-    def count(done: int, total: int) -> None:
-        if done % max(1, total // parts) == 0:
-            _logger.info("%s %d of %d", what, done, total)
-
-    return count
+def _count(what: str, done: int, total: int) -> None:
+    """Say so after every fifth of the work."""
+    if done % max(1, total // 5) == 0:
+        _logger.info("%s %d of %d", what, done, total)
 
 
 def table(results: dict[tuple[str, int], list[dict[str, float]]], designs: tuple[str, ...], seeds: tuple[int, ...]) -> list[dict[str, Any]]:

@@ -25,18 +25,18 @@ class ProgressLog:
     def add(self, step: int, losses: dict[str, float], speed: dict[str, float]) -> None:
         """Note a step; ``speed`` goes to TensorBoard alone, so that two logs of one training are the same."""
         _append(self._path, step, losses)
-        if self._board is not None:
-            for name, value in losses.items():
-                self._board.add_scalar(f"loss/{name}", value, step)
-            for name, value in speed.items():
-                self._board.add_scalar(f"speed/{name}", value, step)
+        self._show("loss", losses, step)
+        self._show("speed", speed, step)
 
     def add_validation(self, step: int, measured: dict[str, float]) -> None:
         """Note how good the averaged weights are on unseen data."""
         _append(self._validation, step, measured)
+        self._show("validation", measured, step)
+
+    def _show(self, group: str, values: dict[str, float], step: int) -> None:
         if self._board is not None:
-            for name, value in measured.items():
-                self._board.add_scalar(f"validation/{name}", value, step)
+            for name, value in values.items():
+                self._board.add_scalar(f"{group}/{name}", value, step)
 
     def close(self) -> None:
         """Draw the curves of all losses and of what unseen data say."""

@@ -5,6 +5,7 @@ In a small training on a CPU the data cost more than the network; and what desig
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -41,7 +42,9 @@ def train_side_by_side(
     runs = {}
     for folder, recipe in recipes.items():
         stage = dit_stage(recipe, image_vae, raymap_vae, source=source, shared=shared)
-        runs[folder] = Run(stage, recipe.dit_loop, folder, preset=recipe.name, engine=recipe.engine)
+        # Drawn ahead, the next batch of one design would be made while another one asks the same pool.
+        engine = dataclasses.replace(recipe.engine, draw_ahead=False)
+        runs[folder] = Run(stage, recipe.dit_loop, folder, preset=recipe.name, engine=engine)
     while unfinished := [run for run in runs.values() if run.step < run.config.steps]:
         run = min(unfinished, key=lambda run: run.step)
         run.train(at_most=_TURN - run.step % _TURN, on_progress=lambda step, steps, losses, name=run.preset: on_step(name, step, steps))
