@@ -57,6 +57,19 @@ class ModelConfig:
                 )
 
 
+_LATER = {"ray_frames", "known_tokens"}
+"""Options of the transformer that came after the first model folders: where a folder lacks one it is the default, as released."""
+
+
+def _told(config: ModelConfig) -> dict[str, Any]:
+    """A configuration as its folder tells it: later options only where they are not the default, so that earlier versions read the rest."""
+    sections = dataclasses.asdict(config)
+    defaults = dataclasses.asdict(DiTConfig())
+    transformer = sections["transformer"]
+    sections["transformer"] = {name: value for name, value in transformer.items() if name not in _LATER or value != defaults[name]}
+    return sections
+
+
 @dataclass(frozen=True, kw_only=True)
 class Loaded:
     """A model read from its folder, in evaluation mode."""
@@ -92,7 +105,8 @@ def save(
         _refuse_foreign(folder)
     config = ModelConfig(transformer=dit.config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
     try:
-        text = json.dumps({"format_version": FORMAT_VERSION, **dataclasses.asdict(config), "info": info or {}}, indent=2, allow_nan=False)
+        content = {"format_version": FORMAT_VERSION, **_told(config), "info": info or {}}
+        text = json.dumps(content, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected values that JSON can hold (no NaN, no tensors), but {error}.") from error
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +192,8 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
     for name, kind in (("transformer", DiTConfig), ("image_vae", VAEConfig), ("raymap_vae", VAEConfig)):
         if not isinstance(content[name], dict):
             raise ValueError(f"{path}: expected section {name!r} to be an object, got {content[name]!r}.")
-        require_names(f"{path}, section {name!r}", (f.name for f in dataclasses.fields(kind)), content[name])
+        expected = {f.name for f in dataclasses.fields(kind)}
+        require_names(f"{path}, section {name!r}", expected, content[name].keys() | (_LATER & expected))
         try:
             choices: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()}
             sections[name] = kind(**choices)

@@ -11,17 +11,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from einops import reduce
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.masks import to_latent_grid
+from fb_core.networks.dit import DiTConfig, TokenFacts
+from fb_core.networks.ray_frames import frames_of_rays
 from fb_core.networks.tiled_decoder import TiledDecoder
 from fb_core.networks.vae import VAE
 
 LATENT_CHANNELS = 16
+FACTOR = 8
+"""Pixels per latent along each side."""
 STATE_CHANNELS = 2 * LATENT_CHANNELS
 CONDITIONING_CHANNELS = 2 * LATENT_CHANNELS + 2
 SEQUENCE_CHANNELS = STATE_CHANNELS + CONDITIONING_CHANNELS
+_ROUNDING = 1e-4  # of the mean of a mask over a latent's pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +36,22 @@ class Conditioning:
 
     channels: Float[Tensor, "*b 34 h w"]
     """Masked image latent, masked raymap latent, image mask, ray mask."""
+    frames: Float[Tensor, "*b th tw 4 4"] | None = None
+    """Frames of the known rays of every token, for networks that attend in them; None where no ray is known, or nobody asks."""
+
+    def known_tokens(self, patch: int) -> Bool[Tensor, "*b th tw"]:
+        """Whether all that a token of ``patch`` x ``patch`` latents shows is known, of images and of rays."""
+        whole = self.image_known.minimum(self.rays_known) > 1 - _ROUNDING
+        return reduce(whole, "... 1 (h p) (w q) -> ... h w", "all", p=patch, q=patch)
+
+    def facts(self, config: DiTConfig) -> TokenFacts:
+        """What a transformer takes beside the channels, for conditionings with a batch dimension."""
+        return TokenFacts(frames=self.frames, known=self.known_tokens(config.patch) if config.known_tokens == "apart" else None)
+
+    def repeated(self, times: int) -> Conditioning:
+        """Every conditioning of the batch so many times in a row."""
+        frames = None if self.frames is None else self.frames.repeat_interleave(times, dim=0)
+        return Conditioning(channels=self.channels.repeat_interleave(times, dim=0), frames=frames)
 
     @property
     def image_known(self) -> Float[Tensor, "*b 1 h w"]:
@@ -42,9 +64,34 @@ class Conditioning:
         return self.channels[..., 2 * LATENT_CHANNELS + 1 :, :, :]
 
 
+def stacked_facts(parts: Sequence[Conditioning], config: DiTConfig) -> TokenFacts:
+    """The facts of several conditionings of the same views (the branches of guidance), as one batch."""
+    channels = torch.stack([part.channels for part in parts])
+    frames = None
+    if config.ray_frames and any(part.frames is not None for part in parts):
+        like = next(part.frames for part in parts if part.frames is not None)
+        identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device).expand_as(like)
+        frames = torch.stack([identity if part.frames is None else part.frames for part in parts])
+    return Conditioning(channels=channels, frames=frames).facts(config)
+
+
 def only_known(values: Float[Tensor, "n c h w"], known: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n c h w"]:
     """``values`` where known (scaled by a fractional mask), 0 elsewhere. Chosen, not multiplied: NaN in unknown pixels does not survive."""
     return torch.where(known > 0, values * known, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def with_guess(
+    told: Float[Tensor, "n c h w"],
+    known: Float[Tensor, "n 1 h w"],
+    guess: Float[Tensor, "n c h w"],
+    belief: Float[Tensor, "n 1 h w"],
+) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
+    """Known pixels and, where nothing is known, guessed ones; and the mask that tells them: the belief, below 1, at guessed pixels.
+
+    A model has to be trained to be told guesses; unlike a known pixel under a fractional mask, a guess keeps its full colour.
+    """
+    guessed = (known == 0) & (belief > 0)
+    return torch.where(guessed, guess, told), torch.where(guessed, belief, known)
 
 
 def assemble(
@@ -52,9 +99,10 @@ def assemble(
     ray_latents: Float[Tensor, "*b 16 h w"],
     image_known: Float[Tensor, "*b 1 h w"],
     rays_known: Float[Tensor, "*b 1 h w"],
+    frames: Float[Tensor, "*b th tw 4 4"] | None = None,
 ) -> Conditioning:
     """Put the encoded parts in channel order."""
-    return Conditioning(channels=torch.cat([image_latents, ray_latents, image_known, rays_known], dim=-3))
+    return Conditioning(channels=torch.cat([image_latents, ray_latents, image_known, rays_known], dim=-3), frames=frames)
 
 
 def encode_known(
@@ -67,14 +115,20 @@ def encode_known(
     raymap_vae: VAE,
     views_at_once: int = 16,
     generators: Sequence[torch.Generator] | None = None,
+    transformer: DiTConfig | None = None,
 ) -> Conditioning:
     """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
 
-    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken.
+    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a ``transformer`` that
+    attends in ray frames these are reckoned too.
     """
     image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once, generators)
     ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generators)
-    return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known))
+    frames = None
+    if transformer is not None and transformer.ray_frames:
+        pairs = zip(raymaps01.split(views_at_once), rays_known.split(views_at_once), strict=True)
+        frames = torch.cat([frames_of_rays(2 * rays - 1, known, FACTOR * transformer.patch) for rays, known in pairs])
+    return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known), frames)
 
 
 def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: tuple[int, int]) -> Conditioning:

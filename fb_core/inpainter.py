@@ -241,6 +241,7 @@ class Fillerbuster:
             **vaes,
             views_at_once=cut.views_encoded,
             generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
+            transformer=self.dit.config,
         )
         del canonical
         height, width = conditioning.channels.shape[-2:]

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data.mesh_pictures import Lighting, draw_with_caster, draw_with_pyvista, read_mesh
-from fb_core.data.sequences import Encode, ViewPool
+from fb_core.data.sequences import Encode, Rendered, ViewPool
 from fb_core.geometry.cameras import Pinholes
 from fb_core.sampling.randomness import generator_of
 
@@ -74,15 +74,15 @@ class MeshPool(ViewPool):
         if not files:
             raise ValueError("meshes: expected at least one file, got none")
 
-    def render(self, numbers: list[int]) -> list[tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]]:
+    def render(self, numbers: list[int]) -> list[Rendered]:
         """A random file for each number; one that cannot be read is told in the log and another is drawn."""
         return [self._render(number) for number in numbers]
 
-    def _render(self, number: int) -> tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]:
+    def _render(self, number: int) -> Rendered:
         generator = generator_of(self.seed, number)
         cameras = sphere_cameras(self.config, generator)
         if not self.with_images:
-            return cameras, None
+            return Rendered(cameras)
         draw = draw_with_pyvista if self.config.renderer == "pyvista" else draw_with_caster
         background, lamp = torch.rand(3, generator=generator), F.normalize(torch.randn(3, generator=generator), dim=0)
         light = Lighting(background=tuple(background.tolist()), lamp=tuple(lamp.tolist()))
@@ -90,7 +90,7 @@ class MeshPool(ViewPool):
         for _ in range(self.config.retries):
             path = self.files[int(torch.randint(len(self.files), (), generator=generator))]
             try:
-                return cameras, draw(read_mesh(path), cameras.to(self.device), light, supersample=self.config.supersample)
+                return Rendered(cameras, draw(read_mesh(path), cameras.to(self.device), light, supersample=self.config.supersample))
             except ValueError as found:
                 _logger.warning("left out a mesh: %s", found)
                 error = found

@@ -56,6 +56,16 @@ class PoolConfig:
             raise ValueError(f"image size: expected a multiple of 16 of at least 16, got {self.image_size}")
 
 
+class Rendered(NamedTuple):
+    """A rendered scene of v views."""
+
+    cameras: Pinholes
+    images: Float[Tensor, "v 3 h w"] | None = None
+    """What they see; None without images."""
+    distance: Float[Tensor, "v 1 h w"] | None = None
+    """How far along each pixel's ray that is, in scene units, where the pool knows it."""
+
+
 class ViewPool(ABC):
     """Rendered scenes of some square views each, renewed step by step."""
 
@@ -69,21 +79,25 @@ class ViewPool(ABC):
         device: torch.device | str = "cpu",
         encode: Encode | None = None,
         with_images: bool = True,
+        with_distance: bool = False,
     ):
         """With ``encode`` (the frozen image autoencoder) the latents of every view are kept, so that they are made once.
 
-        Without images (black ones stand in) nothing is rendered: enough for the raymap autoencoder.
+        Without images (black ones stand in) nothing is rendered: enough for the raymap autoencoder. ``with_distance`` is for pools that
+        give the distances of what is seen.
         """
         self.scenes, self.views, self.image_size, self.renewed_per_step = scenes, views, image_size, renewed_per_step
         self.with_images, self.device, self._encode = with_images, torch.device(device), encode
         self._latents: list[Tensor | None] = [None] * scenes
         self._images = torch.zeros((scenes, views, 3, image_size, image_size), dtype=torch.uint8, device=self.device)
+        shape = (scenes, views, 1, image_size, image_size)
+        self._distance = torch.zeros(shape, dtype=torch.float16, device=self.device) if with_distance and with_images else None
         self._cameras: list[Pinholes | None] = [None] * scenes
         self._ids = [-1] * scenes
 
     @abstractmethod
-    def render(self, numbers: list[int]) -> list[tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]]:
-        """The cameras of some scenes, counted from the beginning of the training, and what they see (None without images)."""
+    def render(self, numbers: list[int]) -> list[Rendered]:
+        """Some scenes, counted from the beginning of the training."""
 
     def slots(self, row: int, batch: int) -> range:
         """Places in the pool that row ``row`` of a batch draws from: every g-th, g being the greatest common divisor of batch and scenes.
@@ -106,8 +120,10 @@ class ViewPool(ABC):
             todo = [scene for scene in todo if scene % self.scenes % stride in mine]
         for start in range(0, len(todo), _SCENES_AT_ONCE):
             numbers = todo[start : start + _SCENES_AT_ONCE]
-            for number, (cameras, images) in zip(numbers, self.render(numbers), strict=True):
+            for number, (cameras, images, distance) in zip(numbers, self.render(numbers), strict=True):
                 self._keep(number, cameras, images)
+                if self._distance is not None and distance is not None:
+                    self._distance[number % self.scenes] = distance.to(self._distance)
 
     def _keep(self, number: int, cameras: Pinholes, images: Tensor | None) -> None:
         slot = number % self.scenes
@@ -148,6 +164,8 @@ class ViewPool(ABC):
         image_known, rays_known = draw_task(len(chosen), self.image_size, task, generator=generator, device=self.device)
         latents = self._latents[slot]
         kept = {} if latents is None else {"image_latents": latents[chosen]}
+        if self._distance is not None:
+            kept["distance"] = self._distance[slot, chosen].float() / framed.frame.scale
         return kept | {
             "images": self._images[slot, chosen].float() / 255,
             "raymaps": framed.raymaps(),
@@ -176,11 +194,12 @@ class RoomPool(ViewPool):
         self, config: PoolConfig, *, seed: int, device: torch.device | str = "cpu", encode: Encode | None = None, with_images: bool = True
     ):
         super().__init__(
-            config.rooms, config.views, config.image_size, config.renewed_per_step, device=device, encode=encode, with_images=with_images
-        )
+            config.rooms, config.views, config.image_size, config.renewed_per_step, device=device, encode=encode,
+            with_images=with_images, with_distance=encode is not None,
+        )  # fmt: skip
         self.config, self.seed = config, seed
 
-    def render(self, numbers: list[int]) -> list[tuple[Pinholes, Float[Tensor, "v 3 h w"] | None]]:
+    def render(self, numbers: list[int]) -> list[Rendered]:
         """Rooms of the families that the curriculum has for these numbers."""
         config = self.config
         rooms, cameras = [], []
@@ -191,6 +210,12 @@ class RoomPool(ViewPool):
             cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))
             rooms.append(room.to(self.device))
         if not self.with_images:
-            return [(group, None) for group in cameras]
+            return [Rendered(group) for group in cameras]
         rendered = render_batch(rooms, [group.to(self.device) for group in cameras], supersample=config.supersample)
-        return [(group, images.rgb) for group, images in zip(cameras, rendered, strict=True)]
+        return [Rendered(group, images.rgb, _distances(group, images.depth)) for group, images in zip(cameras, rendered, strict=True)]
+
+
+def _distances(cameras: Pinholes, depth: Float[Tensor, "v h w"]) -> Float[Tensor, "v 1 h w"]:
+    """Distances along the rays from z-depth."""
+    along = torch.einsum("vhwc,vc->vhw", cameras.directions(), cameras.rotations[:, :, 2])
+    return (depth / along.to(depth))[:, None]

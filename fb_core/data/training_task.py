@@ -41,6 +41,8 @@ class Sequences:
     """1 where the image has ground truth; None = everywhere."""
     rays_truth: Float[Tensor, "b n 1 h w"] | None = None
     """1 where the raymap has ground truth; None = everywhere."""
+    distance: Float[Tensor, "b n 1 h w"] | None = None
+    """How far along each ray the surface lies, in the unit of the raymaps' origins, where the source knows it."""
     captions: tuple[str, ...] | None = None
     """One text for each sequence; None = the empty one (all multi-view data, paper figure A.1)."""
 
@@ -67,6 +69,10 @@ class TaskConfig:
     """Turn the canonical frame by a random heading (paper); off, the heading is 0 as in inference."""
     random_fill: bool = True
     """Rescale small scenes at random (paper); off, they fill the cube as in inference."""
+    guess: float = 0.0
+    """Odds that a sequence's unknown views come with a guess (`fb_core.training.guesses`); the paper has none."""
+    guess_by_depth: float = 0.5
+    """Odds that a guess comes by the true distance with the errors of splats, where the source knows it, instead of by direction."""
 
 
 @runtime_checkable

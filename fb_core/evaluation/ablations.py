@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import encode_in_chunks, encode_known, join, unsplit
+from fb_core.conditioning import encode_in_chunks, encode_known, join, stacked_facts, unsplit
 from fb_core.data.rooms import require_family
 from fb_core.evaluation.completion import RoomViews, unseen_room
 from fb_core.evaluation.image_metrics import psnr, ssim
@@ -115,16 +115,16 @@ def conditional_validation_loss(
     """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
     images, known = room.images.to(model.device), known.to(model.device)
     rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras))).to(model.device)
-    conditioning = encode_known(
-        images, known, rays, torch.ones_like(known), image_vae=model.image_vae, raymap_vae=model.raymap_vae, views_at_once=_CHUNK
-    )
+    vaes = {"image_vae": model.image_vae, "raymap_vae": model.raymap_vae}
+    conditioning = encode_known(images, known, rays, torch.ones_like(known), **vaes, views_at_once=_CHUNK, transformer=model.dit.config)
+    facts = stacked_facts([conditioning], model.dit.config)
     data = unsplit(encode_in_chunks(model.image_vae, images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
     noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed)).to(data)
     index = index_positions(model.dit.config.index, 1, data.shape[1], device=data.device)
     text = None if model.text is None else model.text[None]
 
     def network(state: Tensor, time: Tensor) -> Tensor:
-        return model.dit(join(state[0], conditioning)[None], time, text, index)
+        return model.dit(join(state[0], conditioning)[None], time, text, index, facts)
 
     return float(validation_loss(network, data, noise, steps=times)[:, 0].mean())
 

@@ -4,7 +4,9 @@ Parameter names are those of the released checkpoint. In half precision the resi
 float32, as in the released model; only matrix products and attention run in the parameters' precision.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +15,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from fb_core.networks.embeddings import at_least_float32
+from fb_core.networks.ray_frames import RayFrames, transformed
+
+if TYPE_CHECKING:
+    from fb_core.networks.known_tokens import Relation
 
 EPS = 1e-5
 
@@ -44,9 +50,20 @@ class LayerNorm(nn.Module):
         return F.layer_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), self.bias.to(dtype), EPS)
 
 
-def modulated(x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"]) -> Float[Tensor, "b tokens d"]:
-    """x * (1 + scale) + shift, the same for all tokens of a sample (or of all samples)."""
-    scale, shift = scale_shift[0, :, None], scale_shift[1, :, None]
+class Modulation(NamedTuple):
+    """All that the network takes from the time, for b times: what every norm multiplies by and adds."""
+
+    blocks: Float[Tensor, "depth norms 2 b d"]
+    """(scale, shift) of each block's norms, in the order of the norms."""
+    final: Float[Tensor, "2 b d"]
+    """(scale, shift) of the norm before the output."""
+
+
+def modulated(
+    x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"] | Float[Tensor, "2 #b #tokens d"]
+) -> Float[Tensor, "b tokens d"]:
+    """x * (1 + scale) + shift, the same for all tokens of a sample (or of all samples), or token by token."""
+    scale, shift = scale_shift[:, :, None] if scale_shift.ndim == 3 else scale_shift
     return torch.addcmul(x + shift, x, scale)
 
 
@@ -63,7 +80,9 @@ class AdaptiveNorm(nn.Module):
         raw = self.linear(activated.to(self.linear.weight.dtype))
         return rearrange(raw.to(at_least_float32(raw.dtype)), "b (two d) -> two b d", two=2)
 
-    def forward(self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"]) -> Float[Tensor, "b tokens d"]:
+    def forward(
+        self, x: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"] | Float[Tensor, "2 #b #tokens d"]
+    ) -> Float[Tensor, "b tokens d"]:
         """Normalised and modulated tokens, in the precision of the parameters."""
         return modulated(self.norm(x), scale_shift).to(self.linear.weight.dtype)
 
@@ -97,12 +116,37 @@ class Attention(nn.Module):
         keys = self.norm_k(self._split(self.to_k(context))).to(values.dtype)
         return KeysValues(keys, values)
 
-    def forward(self, x: Float[Tensor, "b tokens d"], context: KeysValues | None = None) -> Float[Tensor, "b tokens d"]:
-        """What every token gathers from `context`, or from all tokens."""
-        keys, values = self.keys_values(x) if context is None else context
-        queries = self.norm_q(self._split(self.to_q(x))).to(values.dtype)
-        y = F.scaled_dot_product_attention(queries, keys, values)
+    def queries(self, x: Float[Tensor, "b tokens d"], dtype: torch.dtype) -> Float[Tensor, "b heads tokens k"]:
+        """What every token asks."""
+        return self.norm_q(self._split(self.to_q(x))).to(dtype)
+
+    def queries_keys_values(
+        self, x: Float[Tensor, "b tokens d"], frames: RayFrames | None
+    ) -> tuple[Float[Tensor, "b heads tokens k"], KeysValues]:
+        """What every token asks and answers, told in the frames of their rays (see `fb_core.networks.ray_frames`)."""
+        own = self.own_keys_values(x, frames)
+        queries = self.queries(x, own.values.dtype)
+        return (queries if frames is None else transformed(queries, frames.inverse.mT)), own
+
+    def own_keys_values(self, x: Float[Tensor, "b tokens d"], frames: RayFrames | None) -> KeysValues:
+        """What every token answers."""
+        own = self.keys_values(x)
+        return own if frames is None else KeysValues(*(transformed(values, frames.frame) for values in own))
+
+    def answered(self, y: Float[Tensor, "b heads tokens k"], frames: RayFrames | None) -> Float[Tensor, "b tokens d"]:
+        """What tokens have gathered, as it is added to them."""
+        y = y if frames is None else transformed(y, frames.inverse)
         return self.to_out[0](rearrange(y, "b heads tokens k -> b tokens (heads k)"))
+
+    def forward(
+        self, x: Float[Tensor, "b tokens d"], context: KeysValues | None = None, frames: RayFrames | None = None
+    ) -> Float[Tensor, "b tokens d"]:
+        """What every token gathers from `context`, or from all tokens, whose frames then count."""
+        if context is None:
+            queries, context = self.queries_keys_values(x, frames)
+        else:
+            queries = self.queries(x, context.values.dtype)
+        return self.answered(F.scaled_dot_product_attention(queries, *context), frames)
 
 
 class GatedProjection(nn.Module):
@@ -150,10 +194,23 @@ class Block(nn.Module):
         return [self.norm1, self.norm2, self.norm3] if self.reads_text else [self.norm1, self.norm3]
 
     def forward(
-        self, x: Float[Tensor, "b tokens d"], scale_shifts: Float[Tensor, "norms 2 #b d"], text: KeysValues | None
+        self,
+        x: Float[Tensor, "b tokens d"],
+        scale_shifts: Float[Tensor, "norms 2 #b d"] | Float[Tensor, "norms 2 #b #tokens d"],
+        text: KeysValues | None,
+        frames: RayFrames | None = None,
+        relation: Relation | None = None,
     ) -> Float[Tensor, "b tokens d"]:
-        """The residual stream after this block, given its norms' modulation and the text's keys and values (None without text)."""
-        x = x + self.attn1(self.norm1(x, scale_shifts[0]))
+        """The residual stream after this block, given its norms' modulation and the text's keys and values (None without text).
+
+        `frames` are those of the tokens' rays. A `relation` says whom the tokens attend to instead of one another, and in which frames.
+        """
+        normed = self.norm1(x, scale_shifts[0])
+        if relation is not None and relation.last is self.attn1:
+            relation.keep(self.attn1, normed)
+            return x
+        x = x + (self.attn1(normed, None, frames) if relation is None else relation.gathered(self.attn1, normed))
         if text is not None:
-            x = x + self.attn2(self.norm2(x, scale_shifts[1]), text)
+            normed = self.norm2(x, scale_shifts[1])
+            x = x + (self.attn2(normed, text) if relation is None else relation.read(self.attn2, normed, text))
         return x + self.ff(self.norm3(x, scale_shifts[-1]))

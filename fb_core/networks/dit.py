@@ -7,15 +7,15 @@ that whatever is constant during sampling can be computed once. Parameter names 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast, get_args
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from fb_core.networks.blocks import Block, KeysValues, modulated
+from fb_core.networks.blocks import Attention, Block, KeysValues, Modulation, modulated
 from fb_core.networks.embeddings import (
     INDEX_MODES,
     IndexMode,
@@ -25,10 +25,14 @@ from fb_core.networks.embeddings import (
     sincos,
     timestep_embedding,
 )
+from fb_core.networks.known_tokens import Relation, Stream, streams
+from fb_core.networks.ray_frames import VECTOR, RayFrames
 
 TIME_SCALE = 1000.0
 TIME_CHANNELS = 256
 FINAL_EPS = 1e-6
+KnownTokens = Literal["joint", "apart"]
+"""Whether tokens of which everything is known are denoised with all others, as released, or see one another alone, free of noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +57,10 @@ class DiTConfig:
     """How views of a sequence are told apart: see `embeddings.index_positions`."""
     mlp_ratio: int = 4
     """Hidden width of the feed-forward layers over the network's width."""
+    ray_frames: bool = False
+    """Attention in the frames of known rays (`fb_core.networks.ray_frames`); no parameter more. The released model has none."""
+    known_tokens: KnownTokens = "joint"
+    """'joint' as released, or 'apart' (`fb_core.networks.known_tokens`)."""
 
     @property
     def width(self) -> int:
@@ -68,17 +76,29 @@ class DiTConfig:
             raise ValueError(f"text_width: expected a width, or 0 for a network without text, got {self.text_width!r}.")
         if self.width < 8 or self.width % 4:
             raise ValueError(f"heads * head_dim: expected a multiple of 4 of at least 8 (position embeddings), got {self.width}.")
+        if not isinstance(self.ray_frames, bool):
+            raise ValueError(f"ray_frames: expected true or false, got {self.ray_frames!r}.")
+        if self.ray_frames and self.head_dim % (2 * VECTOR):
+            raise ValueError(f"head_dim: expected a multiple of {2 * VECTOR} for attention in ray frames, got {self.head_dim}.")
+        if self.known_tokens not in get_args(KnownTokens):
+            raise ValueError(f"known_tokens: expected one of {', '.join(get_args(KnownTokens))}, got {self.known_tokens!r}.")
         if self.index not in INDEX_MODES:
             raise ValueError(f"index: expected one of {', '.join(INDEX_MODES)}, got {self.index!r}.")
 
 
-class Modulation(NamedTuple):
-    """All that the network takes from the time, for b times: what every norm multiplies by and adds."""
+class TokenFacts(NamedTuple):
+    """What is known of the tokens of b sequences of n views besides their channels (`fb_core.conditioning.Conditioning.facts`)."""
 
-    blocks: Float[Tensor, "depth norms 2 b d"]
-    """(scale, shift) of each block's norms, in the order of the norms."""
-    final: Float[Tensor, "2 b d"]
-    """(scale, shift) of the norm before the output."""
+    frames: Float[Tensor, "b n h w 4 4"] | None = None
+    """Frames of their rays, the identity where these are unknown; None = no ray is known. Read by networks with `ray_frames`."""
+    known: Bool[Tensor, "b n h w"] | None = None
+    """Whether everything that the token shows is known; None = no token is. Read by networks with `known_tokens="apart"`."""
+    sequences_per_scene: int = 1
+    """Sequences in a row that know the same, such as draws of noise for one training sequence."""
+
+
+NO_FACTS = TokenFacts()
+"""Nothing is known."""
 
 
 class PatchEmbedding(nn.Module):
@@ -141,20 +161,61 @@ class DiT(nn.Module):
         time: Float[Tensor, "b"],
         text: Float[Tensor, "b words t"] | None = None,
         index: Float[Tensor, "b n"] | None = None,
+        facts: TokenFacts = NO_FACTS,
     ) -> Float[Tensor, "b n z h w"]:
         """Velocity (noise minus data) of the sequence at `time` in [0, 1], 1 being noise; in the sequence's precision.
 
         `text` is given exactly if the configuration has a text width. `index` holds one position in [0, 2 pi] per view (draw it
-        with `index_positions` in training); None means evenly spaced. Raises ValueError for no views, for a size that the patch
-        does not divide, for another channel count, and for a text that is missing or too much.
+        with `index_positions` in training); None means evenly spaced. Where known tokens are apart their velocity is the one that leads
+        straight to what is known. Raises ValueError for no views, for a size that the patch does not divide, for another channel
+        count, and for a text that is missing or too much.
         """
         _, views, channels, height, width = sequence.shape
         if channels != self.config.in_channels:
             raise ValueError(f"sequence: expected {self.config.in_channels} channels, got {channels}.")
+        known, noisy = self.known_of(facts), self.config.out_channels
+        given = sequence
+        if known is not None:
+            told = sequence[:, :, noisy : 2 * noisy]
+            sequence = torch.cat([self.where_known(known, told, sequence[:, :, :noisy]), sequence[:, :, noisy:]], dim=2)
         tokens = self.embed_patches(sequence) + self.positions(views, height, width, index, device=sequence.device)
-        modulation = self.modulate(time)
-        velocity = self.run_blocks(tokens, modulation, self.text_context(text))
-        return self.unpatchify(velocity, views, height, width).to(sequence.dtype)
+        modulation, frames = self.modulate(time), self.frames_of(facts)
+        if known is None:
+            velocity = self.run_blocks(tokens, modulation, self.text_context(text), frames)
+        else:
+            apart, others = streams(rearrange(known, "b n h w -> b (n h w)"), facts.sequences_per_scene)
+            texts = self.text_context(text)
+            looked_up = self.run_known(tokens, apart, texts, frames)
+            velocity = self.run_unknown(tokens, others, looked_up, modulation, texts, frames)
+        velocity = self.unpatchify(velocity, views, height, width).to(sequence.dtype)
+        if known is None:
+            return velocity
+        return self.where_known(known, self.leading_to(told, given[:, :, :noisy], time), velocity)
+
+    def known_of(self, facts: TokenFacts) -> Bool[Tensor, "b n h w"] | None:
+        """Which tokens stand apart; None where none does."""
+        if self.config.known_tokens == "joint" or facts.known is None or not bool(facts.known.any()):
+            return None
+        return facts.known
+
+    def frames_of(self, facts: TokenFacts) -> RayFrames | None:
+        """The frames that attention is told in; None for the identity everywhere."""
+        return RayFrames.of(facts.frames) if self.config.ray_frames and facts.frames is not None else None
+
+    def where_known(
+        self, known: Bool[Tensor, "#b n h w"], yes: Float[Tensor, "#b n z lh lw"], no: Float[Tensor, "#b n z lh lw"]
+    ) -> Float[Tensor, "b n z lh lw"]:
+        """`yes` at the latents of known tokens, `no` at all others."""
+        patch = self.config.patch
+        return torch.where(repeat(known, "b n h w -> b n 1 (h p) (w q)", p=patch, q=patch), yes.to(no.dtype), no)
+
+    @staticmethod
+    def leading_to(
+        told: Float[Tensor, "#b n z h w"], state: Float[Tensor, "#b n z h w"], time: Float[Tensor, "#b"]
+    ) -> Float[Tensor, "b n z h w"]:
+        """The constant velocity that leads a state from `time` straight to the latents that are told at 0 (0 at time 0 itself)."""
+        t = time.view(-1, 1, 1, 1, 1)
+        return torch.where(t > 0, (state - told) / t.clamp(min=torch.finfo(t.dtype).tiny), torch.zeros_like(state))
 
     def embed_patches(self, sequence: Float[Tensor, "b n c h w"], first_channel: int = 0, bias: bool = True) -> Float[Tensor, "b tokens d"]:
         """Project patches to tokens, in the order (view, row, column).
@@ -217,13 +278,52 @@ class DiT(nn.Module):
         return [block.attn2.keys_values(text.to(self.dtype)) for block in self.blocks]
 
     def run_blocks(
-        self, tokens: Float[Tensor, "b tokens d"], modulation: Modulation, contexts: Sequence[KeysValues | None]
+        self,
+        tokens: Float[Tensor, "b tokens d"],
+        modulation: Modulation,
+        contexts: Sequence[KeysValues | None],
+        frames: RayFrames | None = None,
     ) -> Float[Tensor, "b tokens out"]:
         """Patches of velocity of tokens that carry their positions."""
         for block, block_modulation, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
-            tokens = block(tokens, block_modulation, context)
+            tokens = block(tokens, block_modulation, context, frames)
+        return self._patches(tokens, modulation.final)
+
+    def run_known(
+        self, tokens: Float[Tensor, "b tokens d"], stream: Stream, contexts: Sequence[KeysValues | None], frames: RayFrames | None
+    ) -> dict[Attention, list[KeysValues]]:
+        """Keys and values of known tokens in every block, scene by scene: all that other tokens see of them."""
+        frames = None if frames is None else frames.chosen(stream.places)
+        relation = Relation(stream=stream, frames=frames, last=self.blocks[-1].attn1)
+        modulation = self.modulate(tokens.new_zeros(1))
+        row = stream.taken(tokens)
+        for block, scale_shifts, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
+            row = block(row, scale_shifts, context, None, relation)
+        return relation.kept
+
+    def run_unknown(
+        self,
+        tokens: Float[Tensor, "b tokens d"],
+        stream: Stream,
+        known: dict[Attention, list[KeysValues]],
+        modulation: Modulation,
+        contexts: Sequence[KeysValues | None],
+        frames: RayFrames | None,
+    ) -> Float[Tensor, "b tokens out"]:
+        """Patches of velocity of the tokens that are not known, which see the known ones too; zeros at known tokens."""
+        frames = None if frames is None else frames.chosen(stream.places)
+        relation = Relation(stream=stream, frames=frames, known=known)
+        row = stream.taken(tokens)
+        for block, scale_shifts, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
+            row = block(row, stream.modulation(scale_shifts), context, None, relation)
+        patches = self._patches(row, stream.modulation(modulation.final))
+        return stream.put_into(patches.new_zeros(*tokens.shape[:2], patches.shape[-1]), patches)
+
+    def _patches(
+        self, tokens: Float[Tensor, "b tokens d"], scale_shift: Float[Tensor, "2 #b d"] | Float[Tensor, "2 #b #tokens d"]
+    ) -> Float[Tensor, "b tokens out"]:
         tokens = F.layer_norm(tokens, tokens.shape[-1:], eps=FINAL_EPS)
-        return self.proj_out_2(modulated(tokens, modulation.final).to(self.dtype))
+        return self.proj_out_2(modulated(tokens, scale_shift).to(self.dtype))
 
     def unpatchify(self, patches: Float[Tensor, "b tokens out"], views: int, height: int, width: int) -> Float[Tensor, "b n z h w"]:
         """Latents of (view, row, column) tokens whose channels are ordered (row in patch, column in patch, channel)."""

@@ -1,7 +1,7 @@
 """A transformer bound to all that stays constant while one set of views is sampled, so that a step computes only what changes.
 
 Computed once instead of at every step: the patch projection of the conditioning channels, the keys and values of the text in every
-block, the position embeddings, and the modulations of the whole time grid (which reads the modulation layers, a quarter of the
+block, the position embeddings, all that other tokens see of known ones that stand apart, and the modulations of the whole time grid (which reads the modulation layers, a quarter of the
 released weights, once instead of at every step). What the branches of guidance share, the noisy latents' tokens and the
 modulations, is computed once for all of them.
 """
@@ -14,8 +14,9 @@ from einops import rearrange
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fb_core.networks.blocks import KeysValues
-from fb_core.networks.dit import DiT, Modulation
+from fb_core.networks.blocks import Attention, KeysValues, Modulation
+from fb_core.networks.dit import NO_FACTS, DiT, TokenFacts
+from fb_core.networks.known_tokens import streams
 
 
 class Prepared:
@@ -33,6 +34,7 @@ class Prepared:
         *,
         text: Float[Tensor, "texts words t"] | None = None,
         branches_at_once: int | None = None,
+        facts: TokenFacts = NO_FACTS,
     ):
         """Compute the constants.
 
@@ -42,6 +44,7 @@ class Prepared:
             times: every time in [0, 1] at which a velocity will be asked for; others work too, but are computed when asked for.
             text: one embedding for all branches or one for each; None for a network without text.
             branches_at_once: branches that are evaluated as one batch; None is all of them, 1 needs the least memory.
+            facts: what is known of the tokens of every branch, for networks that read it.
 
         Raises ValueError if the conditioning has no branch or other channels than the network expects, or if the texts are not one or b.
         """
@@ -57,6 +60,9 @@ class Prepared:
         self.branches = branches
         self.branches_at_once = branches_at_once or branches
         self._size = height, width
+        self._facts = facts
+        self._told = conditioning[:, :, :noisy] if dit.known_of(facts) is not None else None
+        self._apart: dict[tuple[int, int], dict[Attention, list[KeysValues]]] = {}
         self._tokens = rearrange(dit.embed_patches(conditioning, first_channel=noisy), "b (n places) d -> b n places d", n=views)
         self._contexts = dit.text_context(text)
         self._times = {time: step for step, time in enumerate(times)}
@@ -70,10 +76,9 @@ class Prepared:
 
         `views` says which of the prepared views the state's are, for a window of them that is a sequence of its own; None is all.
         """
-        tokens = self._tokens if views is None else self._tokens[:, views]
-        count = len(state)
-        if count != tokens.shape[1]:
-            raise ValueError(f"state: expected {tokens.shape[1]} views, got {count}.")
+        count, expected = len(state), self._tokens.shape[1] if views is None else len(views)
+        if count != expected:
+            raise ValueError(f"state: expected {expected} views, got {count}.")
         if count not in self._positions:
             self._positions[count] = self.dit.positions(count, *self._size, device=state.device)
         shared = self.dit.embed_patches(state[None], bias=False) + self._positions[count]
@@ -81,15 +86,52 @@ class Prepared:
         velocities = []
         for first in range(0, self.branches, self.branches_at_once):
             part = slice(first, min(first + self.branches_at_once, self.branches))
-            together = shared + rearrange(tokens[part], "b n places d -> b (n places) d")
-            patches = self.dit.run_blocks(together, modulation, [self._context(context, part) for context in self._contexts])
-            velocities.append(self.dit.unpatchify(patches, count, *self._size))
+            velocities.append(self._velocity(state, shared, modulation, time, part, views))
         return torch.cat(velocities).to(state.dtype)
+
+    def _velocity(
+        self,
+        state: Float[Tensor, "n z h w"],
+        shared: Float[Tensor, "1 tokens d"],
+        modulation: Modulation,
+        time: float,
+        part: slice,
+        views: Int[Tensor, "m"] | None,
+    ) -> Float[Tensor, "b n z h w"]:
+        """The velocity of some branches, given what their tokens share."""
+        told_tokens = rearrange(self._tokens[part] if views is None else self._tokens[part][:, views], "b n places d -> b (n places) d")
+        contexts = [self._context(context, part) for context in self._contexts]
+        facts = self._facts_of(part, views)
+        known, frames = self.dit.known_of(facts), self.dit.frames_of(facts)
+        if known is None or self._told is None:
+            return self.dit.unpatchify(self.dit.run_blocks(shared + told_tokens, modulation, contexts, frames), len(state), *self._size)
+        told = self._told[part] if views is None else self._told[part][:, views]
+        apart, others = streams(rearrange(known, "b n h w -> b (n h w)"))
+        looked_up = self._apart.get((part.start, part.stop)) if views is None else None
+        if looked_up is None:
+            clean = self.dit.embed_patches(told, bias=False) + self._positions[len(state)] + told_tokens
+            looked_up = self.dit.run_known(clean, apart, contexts, frames)
+            if views is None:
+                self._apart[part.start, part.stop] = looked_up
+        patches = self.dit.run_unknown(shared + told_tokens, others, looked_up, modulation, contexts, frames)
+        velocity = self.dit.unpatchify(patches, len(state), *self._size)
+        leading = self.dit.leading_to(told, state[None], torch.full((1,), time, device=state.device))
+        return self.dit.where_known(known, leading.expand_as(velocity), velocity)
+
+    def _facts_of(self, part: slice, views: Tensor | None) -> TokenFacts:
+        frames, known = (
+            None if values is None else values[part] if views is None else values[part][:, views] for values in self._facts[:2]
+        )
+        return TokenFacts(frames=frames, known=known)
 
     def only(self, branches: slice) -> "Prepared":
         """The same with some of its branches; shares all constants, so it costs nothing."""
         chosen = copy.copy(self)
         chosen._tokens = self._tokens[branches]
+        frames, known = (None if values is None else values[branches] for values in self._facts[:2])
+        chosen._facts = TokenFacts(frames=frames, known=known)
+        chosen._told = None if self._told is None else self._told[branches]
+        chosen._apart = {}
         chosen.branches = len(chosen._tokens)
         chosen.branches_at_once = min(self.branches_at_once, chosen.branches)
         chosen._contexts = [

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import STATE_CHANNELS, Conditioning
+from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
 from fb_core.networks.dit import DiT
 from fb_core.networks.prepared import Prepared
 from fb_core.sampling.guidance import branches, guidance_map, guided
@@ -96,7 +96,8 @@ class Denoising:
             parts = [*parts, self.conditioning]
         text_scale = sampling.guidance_text if prompted else None
         channels = torch.stack([part.channels for part in parts])
-        prepared = Prepared(self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once)
+        facts = stacked_facts(parts, self.dit.config)
+        prepared = Prepared(self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts)
         if sampling.reference_compatible:
             cut = {"window": sampling.window, "rounds": sampling.rounds, "orders": self.orders}
             return reference_field(prepared, scale, text_scale=text_scale, **cut)

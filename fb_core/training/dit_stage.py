@@ -13,16 +13,19 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit
+from fb_core.conditioning import FACTOR, Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit, with_guess
 from fb_core.data.training_task import Sequences, Source, TaskConfig
 from fb_core.flow import at_time, logit_normal_times, velocity
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.masks import to_latent_grid
-from fb_core.networks.dit import DiT
+from fb_core.networks.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.embeddings import index_positions
+from fb_core.networks.ray_frames import frames_of_rays
 from fb_core.networks.vae import VAE
+from fb_core.training.guesses import Guess, guesses_of
 from fb_core.training.loop import Stage, row_generator
 
+_GUESSES = 3  # stream of random numbers
 EncodeText = Callable[[list[str]], Float[Tensor, "b words t"]]
 """Embeddings of texts."""
 
@@ -39,6 +42,17 @@ class DiTLossConfig:
     """Weight of the raymap channels' loss (paper: 1; its ablation "no-poses": 0)."""
     images_per_row: int = 1
     """Captioned single pictures that stand for one sequence."""
+    draws: int = 1
+    """Draws of (time, noise) for every sequence, which is encoded once, and whose known tokens are computed once where they are apart."""
+
+    pure_noise: float = 0.0
+    """Share of the draws at time 1 exactly, where the answer is the mean of all that may be there; one step from noise needs it."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pure_noise <= 1:
+            raise ValueError(f"training: expected a share of draws of pure noise from 0 to 1, got {self.pure_noise}")
+        if self.draws < 1:
+            raise ValueError(f"training: expected at least 1 draw of noise for every sequence, got {self.draws}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +73,8 @@ class Drawn:
     """The same of the raymap's latent."""
     text: Float[Tensor, "b words t"] | None = None
     """Embeddings of the captions, for networks that read text."""
+    facts: TokenFacts = NO_FACTS
+    """What is known of the tokens."""
 
 
 class Encoded(NamedTuple):
@@ -136,11 +152,19 @@ class DiTStage(Stage):
         """Latents of these rows of a step's batch, on their way between data and noise."""
         data, conditioning, image_weight, rays_weight, captions = self._encoded(step, rows)
         noises, positions = ([row_generator(self.seed, step, row, stream) for row in rows] for stream in (1, 2))
-        mode, (count, views, *latent) = self.network.config.index, data.shape
-        each = count // len(rows)
-        times = torch.cat([logit_normal_times(each, generator=generator) for generator in noises]).to(data.device)
+        mode, (count, views, *latent), draws = self.network.config.index, data.shape, self.config.draws
+        each = count // len(rows) * draws
+        facts = conditioning.facts(self.network.config)
+        if draws > 1:
+            data = data.repeat_interleave(draws, dim=0)
+            conditioning = conditioning.repeated(draws)
+            image_weight, rays_weight = (w if w is None else w.repeat_interleave(draws, dim=0) for w in (image_weight, rays_weight))
+            facts = conditioning.facts(self.network.config)._replace(sequences_per_scene=draws)
+            captions = captions if captions is None else tuple(caption for caption in captions for _ in range(draws))
+        times = torch.cat([self._times(each, generator) for generator in noises]).to(data.device)
         noise = torch.cat([torch.randn(each, views, *latent, generator=generator) for generator in noises]).to(data)
-        index = torch.cat([index_positions(mode, each, views, generator=generator) for generator in positions]).to(data.device)
+        index = torch.cat([index_positions(mode, each // draws, views, generator=generator) for generator in positions]).to(data.device)
+        index = index.repeat_interleave(draws, dim=0)
         return Drawn(
             inputs=join(at_time(data, noise, times), conditioning),
             times=times,
@@ -148,18 +172,28 @@ class DiTStage(Stage):
             velocity=velocity(data, noise),
             image_weight=image_weight,
             rays_weight=rays_weight,
-            text=self._text(captions, count, data.device),
+            text=self._text(captions, len(data), data.device),
+            facts=facts,
         )
+
+    def _times(self, count: int, generator: torch.Generator) -> Float[Tensor, "count"]:
+        times = logit_normal_times(count, generator=generator)
+        if self.config.pure_noise == 0:
+            return times
+        return torch.where(torch.rand(count, generator=generator) < self.config.pure_noise, torch.ones_like(times), times)
 
     def _encoded(self, step: int, rows: range) -> Encoded:
         if self._shared is None:
             return self._encode(step, rows)
-        return self._shared.get((step, rows, self.config.task), lambda: self._encode(step, rows))
+        frames = self.network.config.ray_frames and self.network.config.patch
+        return self._shared.get((step, rows, self.config.task, frames), lambda: self._encode(step, rows))
 
     def _encode(self, step: int, rows: range) -> Encoded:
         self.pool.advance(step, rows)
         sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
-        data, conditioning = encode_sequences(sequences, image_vae=self.image_vae, raymap_vae=self.raymap_vae)
+        guess = guesses_of(sequences, rows, self.config.task, partial(row_generator, self.seed, step, stream=_GUESSES))
+        vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
+        data, conditioning = encode_sequences(sequences, **vaes, guess=guess, transformer=self.network.config)
         image_weight, rays_weight = (_latent_weight(truth) for truth in (sequences.image_truth, sequences.rays_truth))
         return Encoded(data, conditioning, image_weight, rays_weight, sequences.captions)
 
@@ -174,7 +208,7 @@ class DiTStage(Stage):
 
     def losses(self, drawn: Drawn) -> dict[str, Tensor]:
         """Velocity errors of both modalities and their weighted sum."""
-        predicted = self.network(drawn.inputs, drawn.times, drawn.text, drawn.index)
+        predicted = self.network(drawn.inputs, drawn.times, drawn.text, drawn.index, drawn.facts)
         image_error, ray_error = (
             _mean_error(got, wanted, weight)
             for got, wanted, weight in zip(split(predicted), split(drawn.velocity), (drawn.image_weight, drawn.rays_weight), strict=True)
@@ -197,26 +231,35 @@ def _latent_weight(truth: Float[Tensor, "b n 1 h w"] | None) -> Float[Tensor, "b
 
 
 @torch.no_grad()
-def encode_sequences(sequences: Sequences, *, image_vae: VAE, raymap_vae: VAE) -> tuple[Tensor, Conditioning]:
+def encode_sequences(
+    sequences: Sequences, *, image_vae: VAE, raymap_vae: VAE, guess: Guess | None = None, transformer: DiTConfig | None = None
+) -> tuple[Tensor, Conditioning]:
     """(clean latents [b, n, 32, h, w], conditioning) of a batch.
 
     Latents that the pool kept are used. A view that is wholly known conditions with its clean latent, and all wholly unknown ones
-    share one latent, so that only partly known views are encoded twice.
+    share one latent, so that only partly known and guessed views are encoded twice. Ray frames come along for a ``transformer`` that
+    attends in them.
     """
     batch = sequences.images.shape[0]
     parts = []
-    for vae, values, known, kept in (
-        (image_vae, sequences.images, sequences.image_known, sequences.image_latents),
-        (raymap_vae, to_unit_range(sequences.raymaps), sequences.rays_known, None),
+    for vae, values, known, kept, guessed in (
+        (image_vae, sequences.images, sequences.image_known, sequences.image_latents, guess),
+        (raymap_vae, to_unit_range(sequences.raymaps), sequences.rays_known, None, None),
     ):
         values, known = values.flatten(0, 1), known.flatten(0, 1)
         clean = encode_in_chunks(vae, values, 256) if kept is None else kept.flatten(0, 1)
         nothing = encode_in_chunks(vae, torch.zeros_like(values[:1]), 1)
+        told = only_known(values, known)
+        if guessed is not None:
+            told, known = with_guess(told, known, guessed.images.flatten(0, 1), guessed.belief.flatten(0, 1))
         share = known.flatten(1).mean(dim=1)
         masked = torch.where((share > 0)[:, None, None, None], clean, nothing)
         partial = (share > 0) & (share < 1)
         if bool(partial.any()):
-            masked[partial] = encode_in_chunks(vae, only_known(values[partial], known[partial]), 256)
+            masked[partial] = encode_in_chunks(vae, told[partial], 256)
         parts.append([rearrange(x, "(b n) c h w -> b n c h w", b=batch) for x in (clean, masked, to_latent_grid(known))])
     (image, image_masked, image_known), (rays, rays_masked, rays_known) = parts
-    return unsplit(image, rays), assemble(image_masked, rays_masked, image_known, rays_known)
+    frames = None
+    if transformer is not None and transformer.ray_frames:
+        frames = frames_of_rays(sequences.raymaps, sequences.rays_known, FACTOR * transformer.patch)
+    return unsplit(image, rays), assemble(image_masked, rays_masked, image_known, rays_known, frames)
