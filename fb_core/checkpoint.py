@@ -214,6 +214,19 @@ def _open(path: Path, device: torch.device | str):
         raise ValueError(f"{path}: truncated, or not a safetensors file ({error}).") from error
 
 
+def load_section(folder: str | os.PathLike[str], section: str, network: nn.Module) -> None:
+    """Give a network the weights of one section ("transformer", "image_vae" or "raymap_vae") of a model folder, in its own precision.
+
+    Raises ValueError, in one sentence, for a folder that is no model and for weights that do not fit.
+    """
+    path = Path(folder) / WEIGHT_FILES[section]
+    read_config(Path(folder))
+    with _open(path, "cpu") as file:
+        names = list(file.keys())
+        require_shapes(str(path), network, {name: tuple(file.get_slice(name).get_shape()) for name in names})
+        network.load_state_dict({name: file.get_tensor(name) for name in names})
+
+
 def _read_prompt(path: Path, device: torch.device | str) -> Tensor:
     with _open(path, device) as file:
         require_names(str(path), [PROMPT_KEY], file.keys())

@@ -116,13 +116,18 @@ def encode_known(
     views_at_once: int = 16,
     generators: Sequence[torch.Generator] | None = None,
     transformer: DiTConfig | None = None,
+    guess: tuple[Float[Tensor, "n 3 hp wp"], Float[Tensor, "n 1 hp wp"]] | None = None,
 ) -> Conditioning:
     """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
 
     With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a ``transformer`` that
-    attends in ray frames these are reckoned too.
+    attends in ray frames these are reckoned too. A ``guess`` (images, belief) is told where no pixel is known (:func:`with_guess`).
     """
-    image_latents = encode_in_chunks(image_vae, only_known(images, image_known), views_at_once, generators)
+    told = only_known(images, image_known)
+    if guess is not None:
+        told, image_known = with_guess(told, image_known, *guess)
+    image_latents = encode_in_chunks(image_vae, told, views_at_once, generators)
+    del told
     ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generators)
     frames = None
     if transformer is not None and transformer.ray_frames:

@@ -125,7 +125,8 @@ class Fillerbuster:
             prompt: says what is to be seen, for models that read text; None and "" cost nothing.
             current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1,
                 except where `views` knows better. Latents of which they do not know all pixels start from noise; the others join them
-                at the first time that is not above the strength.
+                at the first time that is not above the strength. With `sampling.guess` they are (also) told as a guess: where no pixel is
+                known, theirs are, to be believed as far as `sampling.belief` and their own mask say.
             resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not drawn from.
 
         Raises:
@@ -144,15 +145,19 @@ class Fillerbuster:
         height, width = views.size
         padded = _padded(views.to(self.device))
         frame = _frame_of(padded)
-        started = counts = None
-        if current is not None and sampling.strength < 1:
+        started = counts = guess = None
+        if current is not None:
             current = _padded(current.to(self.device), mode="replicate")
+            guess = current if sampling.guess != "start" else None
+            if sampling.guess == "told":
+                sampling = dataclasses.replace(sampling, strength=1.0)
+        if current is not None and sampling.strength < 1:
             counts = _counting(current, padded)
             if counts is None:  # they tell nothing that is not known anyway
                 sampling = dataclasses.replace(sampling, strength=1.0)
             else:
                 started = self._encoded(current, padded, frame, cut)
-        denoising = self._denoising(padded, frame, started, counts, text, seed, sampling, cut)
+        denoising = self._denoising(padded, frame, started, counts, text, seed, sampling, cut, guess)
         look = None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
         try:
             latents = denoising.run(on_step=on_step, on_trajectory=look, resume=None if resume is None else resume.trajectory)
@@ -227,6 +232,7 @@ class Fillerbuster:
         seed: int,
         sampling: SamplingConfig,
         cut: Cut,
+        guess: Views | None = None,
     ) -> Denoising:
         """What is known of the padded views, encoded, with all draws."""
         canonical = only_known(views.raymaps, views.rays_known)
@@ -242,6 +248,7 @@ class Fillerbuster:
             views_at_once=cut.views_encoded,
             generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
             transformer=self.dit.config,
+            guess=None if guess is None else (guess.images, sampling.belief * guess.image_known),
         )
         del canonical
         height, width = conditioning.channels.shape[-2:]

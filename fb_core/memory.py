@@ -19,7 +19,7 @@ from torch import Tensor
 from fb_core.checkpoint import ModelConfig, autoencoder_dtype
 from fb_core.conditioning import CONDITIONING_CHANNELS, LATENT_CHANNELS, STATE_CHANNELS, decode_in_chunks, encode_in_chunks
 from fb_core.live_bytes import LiveBytes
-from fb_core.networks.dit import DiT
+from fb_core.networks.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.prepared import Prepared
 from fb_core.networks.text import WORDS
 from fb_core.networks.vae import VAE, VAEConfig
@@ -276,7 +276,7 @@ def _denoising_bytes(
     with LiveBytes() as live:
         channels = torch.stack([conditioning] * count)
         texts = torch.empty(count if prompted else 1, WORDS, config.text_width or 0, device="meta") if config.text_width else None
-        prepared = Prepared(dit, channels, times[:-1], text=texts, branches_at_once=branches)
+        prepared = Prepared(dit, channels, times[:-1], text=texts, branches_at_once=branches, facts=_facts(config, count, views, latent))
         predict = tiled(prepared, window=sampling.window, rounds=1)
         scale = torch.empty_like(noise) + 1
         field = guided(predict, scale, text_scale=1.0 if prompted and sampling.guidance_text else None, variant=sampling.guidance)
@@ -285,7 +285,17 @@ def _denoising_bytes(
     kept = 4 * norms * 2 * config.width * sampling.steps
     if texts is not None:
         kept += 2 * texts.shape[0] * WORDS * config.width * dtype.itemsize
+    if config.known_tokens == "apart":  # at most: keys and values of all tokens, should all be known
+        tokens = views * latent[0] * latent[1] // config.patch**2
+        kept += 2 * count * tokens * config.width * dtype.itemsize
     return live.peak + (config.depth - 1) * kept + conditioning.numel() * 4
+
+
+def _facts(config: DiTConfig, branches: int, views: int, latent: tuple[int, int]) -> TokenFacts:
+    """Ray frames where the network reads them; no known tokens, which would only make the work less."""
+    if not config.ray_frames:
+        return NO_FACTS
+    return TokenFacts(frames=_meta(branches, views, latent[0] // config.patch, latent[1] // config.patch, 4, 4))
 
 
 # What would fit ----------------------------------------------------------------------------------------------------

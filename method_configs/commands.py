@@ -68,7 +68,7 @@ def train(
     minutes: float | None = None,
     device: str | None = None,
     half: bool = True,
-    precision: Literal["float32", "bfloat16"] | None = None,
+    precision: Literal["auto", "float32", "bfloat16"] | None = None,
     accumulate: int | None = None,
     recompute: bool = False,
     shard: bool = False,
@@ -82,8 +82,9 @@ def train(
     rooms: bool = False,
     text_encoder: Path | None = None,
     lpips: Path | None = None,
+    start_from: Path | None = None,
 ) -> None:
-    """Train a model from scratch; the same command again goes on where the last one ended. Under torchrun on many devices.
+    """Train a model; the same command again goes on where the last one ended. Under torchrun on many devices.
 
     Args:
         preset: What to train, e.g. rooms-tiny (the bundled model).
@@ -93,7 +94,7 @@ def train(
         minutes: Stop after so many minutes; a transformer that is not done by then is exported as it is.
         device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
         half: Store the model in half precision (the raymap autoencoder never is).
-        precision: Of matrix products and convolutions instead of the preset's; weights stay in float32.
+        precision: Of matrix products and convolutions instead of the preset's (auto: bfloat16 where it is faster); weights stay float32.
         accumulate: Parts that each process does its share of a batch in, one after the other, to save memory.
         recompute: Keep no activations inside blocks, to save memory for a third more time.
         shard: Spread the transformer's weights over the processes (FSDP).
@@ -107,13 +108,14 @@ def train(
         rooms: Procedural rooms beside captures and meshes.
         text_encoder: Clone of openai/clip-vit-large-patch14, for presets that read text.
         lpips: Weights of SqueezeNet 1.1 as torchvision stores them, for the image autoencoder's perceptual loss.
+        start_from: Model folder whose weights the training begins with; its autoencoders are kept as they are.
     """
     from method_configs.training_command import train_preset
 
     train_preset(
         preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half, precision=precision, accumulate=accumulate,
         recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run, captures=captures,
-        meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips,
+        meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips, start_from=start_from,
     )  # fmt: skip
 
 

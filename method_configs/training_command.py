@@ -21,7 +21,7 @@ from fb_core.data.training_data import TrainingData
 from fb_core.training.distributed import Group, joined
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.loop import EngineConfig, OnProgress
-from fb_core.training.recipe import STAGES, Recipe, export, run_stage
+from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
 from method_configs.ablations import PRESETS
 
 _logger = logging.getLogger(__name__)
@@ -52,18 +52,20 @@ def train_preset(
     rooms: bool = False,
     text_encoder: Path | None = None,
     lpips: Path | None = None,
+    start_from: Path | None = None,
 ) -> Path | None:
     """Train what is not trained yet and export; returns the model's folder, or None while stages are missing.
 
     Stages end in order: when the time is up in one, those after it are not begun, because the transformer learns the latents of
     finished autoencoders. Options of the engine that are None or False are the preset's. Under torchrun all its processes train together.
-    The options from ``captures`` on say where the data lie (:class:`fb_core.data.training_data.TrainingData`).
+    ``start_from`` is a model folder to begin with; its autoencoders are kept unless a stage of theirs is named.
+    The options from ``captures`` to ``lpips`` say where the data lie (:class:`fb_core.data.training_data.TrainingData`).
 
     Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive. SystemExit when a signal
     ended it, after a checkpoint.
     """
     data = TrainingData(captures=captures, meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips)
-    recipe = dataclasses.replace(_recipe(preset), data=data)
+    recipe = dataclasses.replace(_recipe(preset), data=data, start_from=start_from)
     _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
     stages = STAGES if stage == "all" else (stage,)
     chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
@@ -75,6 +77,9 @@ def train_preset(
             for name in stages:
                 _say(group, "%s", _told(name, measure(recipe, name, device=where, engine=engine, group=group)))
             return None
+        if stage == "all" and group.is_main:
+            adopt_autoencoders(recipe, output)
+        group.wait()
         if not _train_stages(recipe, stages, output, where, steps, math.inf if minutes is None else minutes, engine, group):
             return None
         if group.is_main:

@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from fb_core.networks.blocks import Attention, Block
 from fb_core.networks.dit import FINAL_EPS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.prepared import Prepared
-from fb_core.networks.ray_frames import RayFrames, transformed
+from fb_core.networks.ray_frames import RayFrames
 
 JOINT = DiTConfig(heads=2, head_dim=16, depth=3, in_channels=10, out_channels=4, text_width=0, ray_frames=True)
 APART = dataclasses.replace(JOINT, known_tokens="apart")

@@ -68,7 +68,9 @@ def test_frames_are_those_of_the_cameras():
     centre = raymaps_of(cameras)[:, 3:, 7:9, 7:9].mean(dim=(2, 3))
     assert float((F.normalize(centre, dim=1) * rotations[:, 0, 0, :, 2]).sum(dim=1).min()) > math.cos(math.radians(0.7))
     # a whole view as one patch looks along its camera's axes
-    torch.testing.assert_close(frames_of_rays(raymaps_of(cameras), everywhere(raymaps_of(cameras)), SIZE)[:, 0, 0, :3, :3], cameras.rotations)
+    torch.testing.assert_close(
+        frames_of_rays(raymaps_of(cameras), everywhere(raymaps_of(cameras)), SIZE)[:, 0, 0, :3, :3], cameras.rotations
+    )
 
 
 def test_a_patch_cut_by_the_border_has_the_frame_of_the_whole():

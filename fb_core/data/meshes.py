@@ -14,8 +14,6 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor
 
 from fb_core.data.mesh_pictures import Lighting, draw_with_caster, draw_with_pyvista, read_mesh
 from fb_core.data.sequences import Encode, Rendered, ViewPool

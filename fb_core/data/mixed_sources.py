@@ -155,15 +155,21 @@ class Later:
         return self._now.sequences(rows, dataclasses.replace(task, views=self._views) if self._is_later else task, draw)
 
 
+_ALL_OR_NONE = ("image_latents", "distance")
+
+
 def joined(parts: list[Sequences]) -> Sequences:
-    """One batch of batches of the same sizes. Latents and distances are kept if all have them; truth is everywhere where nothing is said."""
+    """One batch of batches of the same sizes.
+
+    Latents and distances are kept if all have them; truth is everywhere where nothing is said.
+    """
     fields: dict[str, Tensor | tuple[str, ...] | None] = {}
     for field in dataclasses.fields(Sequences):
         values = [getattr(part, field.name) for part in parts]
         if field.name == "captions":
             given = [value or ("",) * len(part.images) for value, part in zip(values, parts, strict=True)]
             fields[field.name] = sum(given, ()) if any(values) else None
-        elif all(value is None for value in values) or (field.name in ("image_latents", "distance") and any(value is None for value in values)):
+        elif all(value is None for value in values) or (field.name in _ALL_OR_NONE and any(value is None for value in values)):
             fields[field.name] = None
         else:
             whole = [torch.ones_like(part.image_known) if value is None else value for value, part in zip(values, parts, strict=True)]

@@ -34,7 +34,9 @@ class PoolConfig:
     """Which rooms are rendered, and how many stay at hand."""
 
     families: tuple[str, ...] = ("narrow",)
-    """The curriculum: room families that follow one another."""
+    """The curriculum: room families that follow one another, or take turns."""
+    take_turns: bool = False
+    """Every room is of another family than the one before it, instead of ``family_rooms`` of each."""
     family_rooms: int = 10_000
     """Rooms of one family before the next one begins."""
     rooms: int = 400
@@ -204,7 +206,8 @@ class RoomPool(ViewPool):
         config = self.config
         rooms, cameras = [], []
         for number in numbers:
-            family = config.families[min(number // config.family_rooms, len(config.families) - 1)]
+            turn = number % len(config.families) if config.take_turns else min(number // config.family_rooms, len(config.families) - 1)
+            family = config.families[turn]
             room = make_room(self.seed * 1_000_003 + number, FAMILIES[family])
             generator = torch.Generator().manual_seed(self.seed * 7_000_003 + number)
             cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))

@@ -8,6 +8,7 @@ tokens does so on the whole row, and attention goes scene by scene. A scene is o
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -48,13 +49,12 @@ class Stream:
         """Scene by scene."""
         parts = row.split([sequences * tokens for sequences, tokens in self.scenes], dim=2)
         return [
-            rearrange(part, "1 heads (s t) k -> s heads t k", s=sequences)
-            for part, (sequences, _) in zip(parts, self.scenes, strict=True)
+            rearrange(part, "1 heads (s t) k -> s heads t k", s=sequences) for part, (sequences, _) in zip(parts, self.scenes, strict=True)
         ]
 
 
 def streams(known: Bool[Tensor, "b tokens"], sequences_per_scene: int = 1) -> tuple[Stream, Stream]:
-    """(known tokens, all others). Of a scene's sequences, which are consecutive and know the same, the first one's known tokens are taken."""
+    """(known tokens, all others). Of a scene's sequences, which are consecutive and know the same, the first one's known ones count."""
     per_scene = known[::sequences_per_scene]
     counts = per_scene.sum(dim=1).tolist()
     total, tokens = known.shape
@@ -64,9 +64,7 @@ def streams(known: Bool[Tensor, "b tokens"], sequences_per_scene: int = 1) -> tu
     known_stream = Stream(
         places=places[firsts][per_scene], sequences=owner[firsts][per_scene], scenes=tuple((1, count) for count in counts)
     )
-    others = Stream(
-        places=places[~known], sequences=owner[~known], scenes=tuple((sequences_per_scene, tokens - count) for count in counts)
-    )
+    others = Stream(places=places[~known], sequences=owner[~known], scenes=tuple((sequences_per_scene, tokens - count) for count in counts))
     return known_stream, others
 
 
@@ -114,10 +112,7 @@ class Relation:
             return attention.answered(F.scaled_dot_product_attention(queries, *text), None)
         starts = torch.tensor([0, *(sequences for sequences, _ in self.stream.scenes)]).cumsum(0).tolist()
         step = count // starts[-1] if self.known is None else 1  # the known tokens of a scene stand for all of its sequences
-        texts = [
-            KeysValues(*(values[start * step : end * step : step] for values in text))
-            for start, end in zip(starts[:-1], starts[1:], strict=True)
-        ]
+        texts = [KeysValues(*(values[start * step : end * step : step] for values in text)) for start, end in pairwise(starts)]
         return attention.answered(self._attended(queries, texts), None)
 
     def _attended(self, queries: Float[Tensor, "1 heads row k"], looked_up: list[KeysValues]) -> Float[Tensor, "1 heads row k"]:

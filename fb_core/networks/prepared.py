@@ -1,9 +1,9 @@
 """A transformer bound to all that stays constant while one set of views is sampled, so that a step computes only what changes.
 
 Computed once instead of at every step: the patch projection of the conditioning channels, the keys and values of the text in every
-block, the position embeddings, all that other tokens see of known ones that stand apart, and the modulations of the whole time grid (which reads the modulation layers, a quarter of the
-released weights, once instead of at every step). What the branches of guidance share, the noisy latents' tokens and the
-modulations, is computed once for all of them.
+block, all that other tokens see of known ones that stand apart, the position embeddings, and the modulations of the whole time grid
+(which reads the modulation layers, a quarter of the released weights, once instead of at every step). What the branches of guidance
+share, the noisy latents' tokens and the modulations, is computed once for all of them.
 """
 
 import copy

@@ -10,7 +10,8 @@ by their frame, and what is gathered by the inverse of the query's frame:
     q_i' . k_j' = (G_i^-T q_i) . (G_j k_j) = q_i . (G_i^-1 G_j) k_j,     y_i = G_i^-1 sum_j a_ij G_j v_j
 
 A token without known rays has the identity. The idea is that of geometric-transform attention (Miyato et al. 2024) and of projective
-position encodings (Li et al. 2025), here from raymaps alone, so that it holds for any lens, any crop, and any mix of known and unknown rays.
+position encodings (Li et al. 2025), here from raymaps alone, so that it holds for any lens, any crop, and any mix of known and unknown
+rays.
 """
 
 from __future__ import annotations

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.sampling.solvers import SOLVERS
 from fb_core.sampling.time_grids import time_grid
 
+Guess = Literal["start", "told", "both"]
+"""How a guess of what is to be generated enters."""
 POSE_STEPS, POSE_WINDOW = 8, 8
 """Steps that raymaps need, and views per window."""
 
@@ -38,6 +40,11 @@ class SamplingConfig:
     """Time shift of the grid; above 1 spends more steps near the noise (docs/speed_and_accuracy.md has what 2 is worth)."""
     strength: float = 1.0
     """Time at which sampling starts from the `current` views that are given; 1 is pure noise, and they do not matter."""
+    guess: Guess = "start"
+    """How `current` views enter: 'start', sampling starts from them at `strength`; 'told', they are part of the conditioning, for models
+    that were trained to be told guesses; or 'both'."""
+    belief: float = 0.7
+    """How far a guess that is told is to be believed, 0 to 1 (see `fb_core.training.guesses` for what models learn)."""
     known: str = "guided"
     """How known content enters: 'guided' by conditioning and guidance alone (paper), or 'imposed', re-imposed on wholly known latents."""
     window: int | None = None
@@ -58,6 +65,10 @@ class SamplingConfig:
         time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {', '.join(SOLVERS)}, got {self.solver!r}")
+        if self.guess not in get_args(Guess):
+            raise ValueError(f"guess: expected one of {', '.join(get_args(Guess))}, got {self.guess!r}")
+        if not 0 < self.belief < 1:
+            raise ValueError(f"belief: expected a number between 0 and 1, got {self.belief}; what is certain is known, not guessed")
         if self.known not in ("guided", "imposed"):
             raise ValueError(f"known: expected 'guided' or 'imposed', got {self.known!r}")
         for name in ("rounds", "views_at_once", "window", "memory_budget_bytes"):

@@ -11,6 +11,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from fb_core.live_bytes import LiveBytes
+from fb_core.networks.precision import resolved
 from fb_core.training.distributed import ALONE, Group, own_part
 from fb_core.training.loop import EngineConfig, Run
 from fb_core.training.recipe import Recipe, make_stage
@@ -68,7 +69,7 @@ def measure(recipe: Recipe, stage: str, *, device: torch.device, engine: EngineC
         steps_per_second=rate,
         data_share=waited / duration,
         flops=flops.get_total_flops(),
-        utilisation=per_second / _matmul_rate(device, torch.bfloat16 if engine.precision == "bfloat16" else torch.float32),
+        utilisation=per_second / _matmul_rate(device, resolved(engine.precision, device)),
     )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,7 @@ from torch.utils.checkpoint import checkpoint
 
 from fb_core.networks.blocks import Block
 from fb_core.networks.dit import DiT
+from fb_core.networks.precision import PRECISIONS, Precision, in_words, resolved
 from fb_core.networks.vae import Resnet
 from fb_core.sampling.randomness import generator_of
 from fb_core.training.checkpoints import Checkpoints
@@ -110,8 +111,9 @@ class LoopConfig:
 class EngineConfig:
     """How the machine does it; but for rounding, none of this changes what is learned."""
 
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of matrix products and convolutions (autocast); weights, their average, norms and losses stay in float32."""
+    precision: Precision = "float32"
+    """Of matrix products and convolutions (autocast) and of Muon's iteration; weights, their average, norms and losses stay in float32.
+    'auto' is bfloat16 where the device is faster at it."""
     accumulate: int = 1
     """Parts that a process does its rows of a batch in, one after the other."""
     recompute: bool = False
@@ -130,8 +132,8 @@ class EngineConfig:
     def __post_init__(self) -> None:
         if self.accumulate < 1 or self.keep < 1 or self.sheet_every < 0:
             raise ValueError(f"training: accumulate and keep must be at least 1 and sheet_every at least 0, got {self}")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ValueError(f"training: expected precision float32 or bfloat16, got {self.precision!r}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"training: expected a precision out of {', '.join(PRECISIONS)}, got {self.precision!r}")
 
 
 class Averaged:
@@ -198,9 +200,15 @@ class Run:
             _recompute_blocks(stage.network)
         if sharded:
             shard(stage.network)  # type: ignore[arg-type]
+        device = next(stage.network.parameters()).device
+        self.dtype = resolved(engine.precision, device)
+        """Precision of matrix products."""
+        if engine.precision == "auto" and group.is_main:
+            _logger.info("%s: matrix products in %s", stage.name, in_words("auto", device))
         self.optimizers = make_optimizers(
-            stage.network, name=config.optimizer, learning_rate=config.learning_rate, weight_decay=config.weight_decay, betas=config.betas
-        )
+            stage.network, name=config.optimizer, learning_rate=config.learning_rate, weight_decay=config.weight_decay,
+            betas=config.betas, iteration=self.dtype,
+        )  # fmt: skip
         if stage.critic is not None:
             self.optimizers += make_optimizers(
                 stage.critic, name="adamw", learning_rate=config.learning_rate, weight_decay=config.weight_decay, betas=config.betas
@@ -303,7 +311,7 @@ class Run:
 
     def _autocast(self) -> torch.autocast:
         device = next(self.stage.network.parameters()).device.type
-        return torch.autocast(device, torch.bfloat16, enabled=self.engine.precision == "bfloat16")
+        return torch.autocast(device, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
 
     def _tell(self, losses: dict[str, float], seconds: float, on_progress: OnProgress | None) -> None:
         keep = min(0.98, 1 - 1 / self.step)

@@ -1,7 +1,7 @@
 """Muon (Jordan et al. 2024): steps of orthogonalised momentum for the matrices inside a network, at a speed that a CPU can afford.
 
-torch's own Muon iterates in bfloat16, one matrix after the other. Without bfloat16 hardware that takes longer than the training step
-itself; so here the iteration has the precision that the device is fast at, and equal shapes go through it together.
+torch's own Muon iterates in bfloat16, one matrix after the other. Where bfloat16 is emulated that takes longer than the training step
+itself; so here the iteration has the precision that the training has (bfloat16 on a GPU), and equal shapes go through it together.
 """
 
 from __future__ import annotations
@@ -21,15 +21,24 @@ _ITERATIONS = 5
 class Muon(Optimizer):
     """Nesterov momentum, its matrix made nearly orthogonal, scaled so that AdamW's learning rates serve (root mean square 0.2)."""
 
-    def __init__(self, matrices: Iterable[nn.Parameter], *, learning_rate: float, weight_decay: float = 0.0, momentum: float = 0.95):
-        """``matrices`` [rows, columns] each; weight decay is decoupled.
+    def __init__(
+        self,
+        matrices: Iterable[nn.Parameter],
+        *,
+        learning_rate: float,
+        weight_decay: float = 0.0,
+        momentum: float = 0.95,
+        iteration: torch.dtype = torch.float32,
+    ):
+        """``matrices`` [rows, columns] each, or kernels of convolutions, whose rows are their output channels.
 
-        Raises ValueError for parameters that are no matrices.
+        Weight decay is decoupled; ``iteration`` is the precision of the products. Raises ValueError for parameters that are neither.
         """
         matrices = list(matrices)
-        if odd := [tuple(matrix.shape) for matrix in matrices if matrix.ndim != 2]:
-            raise ValueError(f"muon: expected matrices, got parameters of shape {odd[0]}; give those to AdamW")
+        if odd := [tuple(matrix.shape) for matrix in matrices if matrix.ndim not in (2, 4)]:
+            raise ValueError(f"muon: expected matrices or kernels, got parameters of shape {odd[0]}; give those to AdamW")
         super().__init__(matrices, {"lr": learning_rate, "weight_decay": weight_decay, "momentum": momentum})
+        self._iteration = iteration
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
@@ -43,14 +52,16 @@ class Muon(Optimizer):
             for matrix in group["params"]:
                 if matrix.grad is not None:
                     alike[matrix.shape].append(matrix)
-            for shape, matrices in alike.items():
-                directions = orthogonalised(torch.stack([self._direction(matrix, group["momentum"]) for matrix in matrices]))
-                length = 0.2 * max(shape) ** 0.5
+            for matrices in alike.values():
+                momenta = torch.stack([self._direction(matrix, group["momentum"]).flatten(1) for matrix in matrices])
+                directions = orthogonalised(momenta, self._iteration)
+                length = 0.2 * max(momenta.shape[1:]) ** 0.5
                 torch._foreach_mul_(matrices, 1 - group["lr"] * group["weight_decay"])
-                torch._foreach_add_(matrices, list(directions.unbind()), alpha=-group["lr"] * length)
+                steps = [direction.view(matrix.shape) for direction, matrix in zip(directions.unbind(), matrices, strict=True)]
+                torch._foreach_add_(matrices, steps, alpha=-group["lr"] * length)
         return loss
 
-    def _direction(self, matrix: Tensor, momentum: float) -> Float[Tensor, "rows columns"]:
+    def _direction(self, matrix: Tensor, momentum: float) -> Float[Tensor, "rows *columns"]:
         """The gradient, mixed with its running mean a step ahead."""
         assert matrix.grad is not None
         state = self.state[matrix]
@@ -60,7 +71,7 @@ class Muon(Optimizer):
         return matrix.grad.lerp(mean, momentum)
 
 
-def orthogonalised(matrices: Float[Tensor, "k rows columns"]) -> Float[Tensor, "k rows columns"]:
+def orthogonalised(matrices: Float[Tensor, "k rows columns"], iteration: torch.dtype = torch.float32) -> Float[Tensor, "k rows columns"]:
     """Matrices with the same singular vectors, and singular values between about 0.7 and 1.2 (0 stays 0); any scale, zeros included.
 
     A Newton-Schulz iteration of degree five: three products of matrices each time, on the shorter side.
@@ -68,8 +79,8 @@ def orthogonalised(matrices: Float[Tensor, "k rows columns"]) -> Float[Tensor, "
     a, b, c = _QUINTIC
     tall = matrices.shape[1] > matrices.shape[2]
     x = matrices.mT if tall else matrices
-    x = x.to(torch.bfloat16 if x.is_cuda else torch.float32)
     x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=1e-30)
+    x = x.to(torch.bfloat16 if x.is_cuda else iteration)
     for _ in range(_ITERATIONS):
         gram = x @ x.mT
         polynomial = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)

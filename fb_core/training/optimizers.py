@@ -13,30 +13,42 @@ from fb_core.training.muon import Muon
 
 OptimizerName = Literal["adamw", "muon"]
 OPTIMIZERS: tuple[OptimizerName, ...] = get_args(OptimizerName)
-_BLOCKS = ("transformer_blocks.",)
 
 
 def make_optimizers(
-    network: nn.Module, *, name: OptimizerName, learning_rate: float, weight_decay: float, betas: tuple[float, float]
+    network: nn.Module,
+    *,
+    name: OptimizerName,
+    learning_rate: float,
+    weight_decay: float,
+    betas: tuple[float, float],
+    iteration: torch.dtype = torch.float32,
 ) -> list[Optimizer]:
-    """The optimisers of a network; vectors (gains, biases) have no weight decay.
+    """The optimisers of a network; vectors (gains, biases) have no weight decay. ``iteration`` is the precision of Muon's iteration.
 
-    Muon takes the matrices of the transformer's blocks, AdamW all else; Muon's step is scaled to AdamW's usual size, so that one learning
+    Muon takes the matrices of the transformer's blocks and the kernels inside an autoencoder's, AdamW all else; Muon's step is scaled to AdamW's usual size, so that one learning
     rate serves both.
     """
     matrices, vectors, orthogonal = [], [], []
     for parameter_name, parameter in network.named_parameters():
         if not parameter.requires_grad:
             continue
-        if name == "muon" and parameter.ndim == 2 and parameter_name.startswith(_BLOCKS):
+        if name == "muon" and _is_inner(parameter_name, parameter):
             orthogonal.append(parameter)
         else:
             (matrices if parameter.ndim >= 2 else vectors).append(parameter)
     groups = [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
     optimizers: list[Optimizer] = [torch.optim.AdamW(groups, lr=learning_rate, betas=betas, foreach=True)]
     if orthogonal:
-        optimizers.append(Muon(orthogonal, learning_rate=learning_rate, weight_decay=weight_decay))
+        optimizers.append(Muon(orthogonal, learning_rate=learning_rate, weight_decay=weight_decay, iteration=iteration))
     return optimizers
+
+
+def _is_inner(name: str, parameter: nn.Parameter) -> bool:
+    """Matrices of the transformer's blocks, kernels of the autoencoders' (not of their first and last layers)."""
+    if parameter.ndim == 2:
+        return name.startswith("transformer_blocks.")
+    return parameter.ndim == 4 and "_block" in name and parameter[0].numel() > 1
 
 
 def load_optimizer(optimizer: Optimizer, state: dict) -> None:

@@ -21,7 +21,9 @@ from fb_core.data.training_task import Source
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.networks.weights import Network
 from fb_core.sampler import SamplingConfig
+from fb_core.training.checkpoints import Checkpoints
 from fb_core.training.distributed import ALONE, Group
 from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
 from fb_core.training.linear_start import start_linear
@@ -76,6 +78,8 @@ class Recipe:
     """How a machine trains it, unless the command says otherwise."""
     seed: int = 0
     """Decides rooms, weights and every draw."""
+    start_from: Path | None = None
+    """Model folder whose weights the networks begin with; None = fresh ones."""
 
 
 def run_stage(
@@ -141,8 +145,9 @@ def dit_stage(
     shared: SharedBatches | None = None,
 ) -> DiTStage:
     """The transformer with fresh weights between finished autoencoders; ``source`` and ``shared`` where trainings share their data."""
+    network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed))
     return DiTStage(
-        DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed)).to(device),
+        _begun(network, recipe, "transformer").to(device),
         image_vae=image_vae,
         raymap_vae=raymap_vae,
         pool=sequences_of(recipe, image_vae, device, rank) if source is None else source,
@@ -221,7 +226,38 @@ def _new_vae(recipe: Recipe, kind: str) -> VAE:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         network = VAE(config)
-    return start_linear(network, torch.Generator().manual_seed(recipe.seed)) if config.norm == "none" else network
+    network = start_linear(network, torch.Generator().manual_seed(recipe.seed)) if config.norm == "none" else network
+    return _begun(network, recipe, kind.replace("-", "_"))
+
+
+def _begun(network: Network, recipe: Recipe, section: str) -> Network:
+    """The network with the weights that the recipe starts from, if it does."""
+    if recipe.start_from is not None:
+        checkpoint.load_section(recipe.start_from, section, network)
+    return network
+
+
+def adopt_autoencoders(recipe: Recipe, folder: Path) -> None:
+    """Take both autoencoders of the model that the recipe starts from as finished stages, where there is none yet.
+
+    Raises ValueError for a folder that is no model, or one whose autoencoders are others than the recipe's.
+    """
+    if recipe.start_from is None:
+        return
+    config, info = checkpoint.read_config(recipe.start_from)
+    records = {record.get("stage"): record for record in info.get("training", [])}
+    for kind, loop in zip(STAGES[:2], (recipe.image_vae_loop, recipe.raymap_vae_loop), strict=True):
+        target = folder / kind
+        if (target / "spread.json").exists():
+            continue
+        network, record = _new_vae(recipe, kind), records.get(kind, {})
+        theirs = config.image_vae if kind == "image-vae" else config.raymap_vae
+        state = {"stage": kind, "preset": recipe.name, "step": loop.steps, "average": network.state_dict()}
+        state |= {"seconds": record.get("seconds", 0), "smoothed": record.get("losses", {})}
+        target.mkdir(parents=True, exist_ok=True)
+        Checkpoints(target, keep=1).write(state)
+        spread = {"scaling": theirs.scaling} | record.get("reconstruction", {}) | {"scaling": theirs.scaling}
+        (target / "spread.json").write_text(json.dumps(spread, indent=1) + "\n")
 
 
 def trained_vae(recipe: Recipe, kind: str, folder: Path, device: torch.device | str = "cpu") -> VAE:
@@ -267,6 +303,8 @@ def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = t
         "sampling": _differences(recipe.sampling),
         "training": records,
     }
+    if recipe.start_from is not None:
+        info["started_from"] = checkpoint.model_hash(recipe.start_from)
     prompt = _text_encoder(recipe, "cpu").encode([""])[0] if recipe.dit.text_width else None
     networks = {"dit": dit, "image_vae": vaes["image-vae"], "raymap_vae": vaes["raymap-vae"]}
     checkpoint.save(output, **networks, info=info, empty_prompt=prompt, dtype=dtype)
