@@ -31,6 +31,8 @@ class Rooms:
     """Strengths at which the model also starts from the pixels carried over by direction, instead of from noise; none to leave it out."""
     samples: int = 4
     """Samples whose mean is scored, too; 1 to leave it out."""
+    told: bool | None = None
+    """Also tell the model what is carried over, as a guess; by default if it was trained to be told."""
     seed: int = 0
     """Decides rooms, cameras and samples."""
     json: Path | None = None
@@ -45,7 +47,7 @@ class Rooms:
         from rich.progress import track
 
         from fb_core.evaluation.benchmarks import Report
-        from fb_core.evaluation.completion import CompletionTask, RoomResult, evaluate_completion, mean_of, started_at, summary
+        from fb_core.evaluation.completion import TOLD, CompletionTask, RoomResult, evaluate_completion, mean_of, started_at, summary
         from fb_core.inpainter import Fillerbuster
 
         if not all(0 < strength < 1 for strength in self.strengths):
@@ -55,14 +57,15 @@ class Rooms:
         completer = Fillerbuster.from_pretrained(self.model)
         task = CompletionTask(rooms=self.rooms, views=self.views, known=self.known, family=self.family, seed=self.seed)
         recommended = completer.recommended_sampling
+        told = recommended.guess != "start" if self.told is None else self.told
         report, results = Report(seed=self.seed), list[RoomResult]()
         for scale in self.guidance or (recommended.guidance_unknown,):
             sampling = dataclasses.replace(recommended, guidance_unknown=scale)
             began = time.process_time()
-            iterator = evaluate_completion(completer, task, sampling, strengths=self.strengths, samples=self.samples)
+            iterator = evaluate_completion(completer, task, sampling, strengths=self.strengths, samples=self.samples, told=told)
             results = list(track(iterator, description=f"guidance {scale:g}", total=self.rooms, transient=True))
-            seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths))
-            times = {"model": 1.0, mean_of(self.samples): 1.0} | {started_at(strength): strength for strength in self.strengths}
+            seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths) + told)
+            times = {"model": 1.0, TOLD: 1.0, mean_of(self.samples): 1.0} | {started_at(strength): strength for strength in self.strengths}
             mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds}
             for method, values in summary(results).items():
                 own = mine | {"strength": times[method]} if method in times else dict.fromkeys([*mine, "strength"], "-")
@@ -77,9 +80,9 @@ def _draw(path: Path, results: Sequence, known: int, completer) -> None:
 
     strips = []
     for number, result in enumerate(results):
-        hidden = result.truth[known:]
+        hidden, shown = result.truth[known:], TOLD if TOLD in result.psnr else "model"
         strips.append(Strip(heading=f"Room {number}: known views", pictures=list(result.truth[:known])))
-        strips.append(Strip(heading=f"Generated ({result.psnr['model']:.1f} dB)", pictures=list(result.completed[known:])))
+        strips.append(Strip(heading=f"Generated ({result.psnr[shown]:.1f} dB)", pictures=list(result.completed[known:])))
         strips.append(Strip(heading="Truth", pictures=list(hidden)))
     path.parent.mkdir(parents=True, exist_ok=True)
     title = f"Unseen rooms completed by {completer.info.get('preset', 'a model')} ({completer.model_hash[:8]})"

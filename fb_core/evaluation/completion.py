@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,8 @@ from fb_core.data.telea import inpainted
 from fb_core.evaluation.image_metrics import psnr
 from fb_core.evaluation.reprojection import reproject
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, Carried, carried_over
+from fb_core.geometry.raymap import raymaps_of
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.views import Views
 
@@ -58,6 +60,8 @@ class RoomResult:
     """The same with the unknown views generated."""
     psnr: dict[str, float]
     """Mean PSNR in dB over the unknown views, per method."""
+    edges: dict[str, float] = field(default_factory=dict)
+    """Edge energy over the unknown views, per method (:func:`edge_energy`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,19 +118,41 @@ def complete_hidden(
     *,
     seed: int,
     start: Float[Tensor, "m 3 h w"] | None = None,
+    start_known: Float[Tensor, "m 1 h w"] | None = None,
 ) -> Float[Tensor, "m 3 h w"]:
-    """The hidden views as the model generates them in one sequence with the given ones; ``start`` is what it starts from at a strength
-    below 1."""
+    """The hidden views as the model generates them in one sequence with the given ones.
+
+    ``start`` is a guess of them, there where ``start_known`` is 1 (default: everywhere), which enters as ``sampling.guess`` says.
+    """
     known = Views.known(given.images, given.cameras)
     views = Views.cat([known, Views.unknown(hidden)])
-    current = None if start is None else Views.cat([known, Views.known(start, hidden)])
+    current = None if start is None else Views.cat([known, Views.known(start, hidden, mask=start_known)])
     completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling, current=current)
     return completed.images[len(given.images) :]
+
+
+def _told_guess(given: RoomViews, hidden: Pinholes) -> Carried:
+    known = torch.ones_like(given.images[:, :1])
+    return carried_over(given.images, known, raymaps_of(given.cameras), raymaps_of(hidden))
 
 
 def started_at(strength: float) -> str:
     """The name of the model that starts from what is reprojected, noised to that time."""
     return f"model from reprojected, strength {strength:g}"
+
+
+TOLD = "model told what is carried over"
+"""The name of the model that is told the pixels carried over by direction, as a guess with a mask between 0 and 1."""
+
+
+def edge_energy(generated: Float[Tensor, "m 3 h w"], truth: Float[Tensor, "m 3 h w"]) -> float:
+    """Mean magnitude of the gradient of generated pictures over that of the truth: 1 is as sharp, 0 is flat."""
+
+    def magnitude(images: Tensor) -> Tensor:
+        down, right = images[..., 1:, :-1] - images[..., :-1, :-1], images[..., :-1, 1:] - images[..., :-1, :-1]
+        return (down.square() + right.square()).sqrt().mean()
+
+    return float(magnitude(generated) / magnitude(truth))
 
 
 def mean_of(samples: int) -> str:
@@ -141,11 +167,13 @@ def evaluate_completion(
     *,
     strengths: Sequence[float] = (),
     samples: int = 1,
+    told: bool = False,
     on_room: Callable[[int, int], None] | None = None,
 ) -> Iterable[RoomResult]:
     """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result.
 
-    With several ``samples`` their mean is scored, too.
+    With several ``samples`` their mean is scored, too; with ``told`` the model that is told what is carried over, which is then what is
+    shown as completed.
     """
     averaged = (mean_of(samples),) if samples > 1 else ()
     for number in range(task.rooms):
@@ -157,13 +185,20 @@ def evaluate_completion(
             later = dataclasses.replace(sampling, strength=strength)
             start = answers["reprojected"]
             answers[started_at(strength)] = complete_hidden(model, given, hidden.cameras, later, seed=seed, start=start)
+        if told:
+            guess = _told_guess(given, hidden.cameras)
+            later = dataclasses.replace(sampling, guess="told", belief=BELIEF_BY_DIRECTION)
+            answers[TOLD] = complete_hidden(model, given, hidden.cameras, later, seed=seed, start=guess.images, start_known=guess.there)
         if averaged:
             others = [_OTHER_SAMPLE * other + seed for other in range(1, samples)]
             drawn = [completed, *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others)]
             answers[mean_of(samples)] = torch.stack(drawn).mean(dim=0)
-        methods = (*METHODS, *map(started_at, strengths), *averaged)
+        methods = (*METHODS, *map(started_at, strengths), *((TOLD,) if told else ()), *averaged)
         errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in methods}
-        yield RoomResult(truth=room.images, completed=torch.cat([given.images, completed]), psnr=errors)
+        edges = {name: edge_energy(answers[name], hidden.images) for name in methods}
+        yield RoomResult(
+            truth=room.images, completed=torch.cat([given.images, answers[TOLD] if told else completed]), psnr=errors, edges=edges
+        )
         if on_room is not None:
             on_room(number + 1, task.rooms)
 
@@ -177,6 +212,8 @@ def summary(results: list[RoomResult]) -> dict[str, dict[str, float]]:
     for method in results[0].psnr:
         above = mean_psnr([result.psnr[method] - result.psnr["reprojected"] for result in results])
         rows[method] = mean_psnr([result.psnr[method] for result in results]) | {f"above_{name}": value for name, value in above.items()}
+        if method in results[0].edges:
+            rows[method]["edges"] = sum(result.edges[method] for result in results) / len(results)
     return rows
 
 

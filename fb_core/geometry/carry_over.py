@@ -16,6 +16,10 @@ from torch import Tensor
 
 from fb_core.geometry.raymap import axes_of
 
+BELIEF_BY_DIRECTION = 0.35
+"""How far to believe pixels that are carried over by direction alone, which are off where surfaces are near (what models learn)."""
+BELIEF_OF_RENDERS = 0.7
+"""How far to believe pixels whose geometry is known but for the errors of splats (what models learn)."""
 _LEAST_COSINE = 0.05
 """Rays that leave a known view's axis by more than 87 degrees are not looked up in it."""
 _WHOLE = 0.99

@@ -16,12 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.data.training_task import Draw, Sequences, TaskConfig
-from fb_core.geometry.carry_over import Carried, carried_over
+from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, BELIEF_OF_RENDERS, Carried, carried_over
 
-BELIEF_BY_DIRECTION = 0.35
-"""What the mask says of pixels that are carried over by direction alone, which are off where surfaces are near."""
-BELIEF_OF_RENDERS = 0.7
-"""What the mask says of pixels whose geometry is known but for the errors of splats."""
 _JITTER = 0.1
 _WORST_DEPTH = 0.12  # relative, of the waves by which surfaces lie wrong
 _WORST_SCALE = 0.08

@@ -26,8 +26,8 @@ def make_optimizers(
 ) -> list[Optimizer]:
     """The optimisers of a network; vectors (gains, biases) have no weight decay. ``iteration`` is the precision of Muon's iteration.
 
-    Muon takes the matrices of the transformer's blocks and the kernels inside an autoencoder's, AdamW all else; Muon's step is scaled to AdamW's usual size, so that one learning
-    rate serves both.
+    Muon takes the matrices of the transformer's blocks and the kernels inside an autoencoder's, AdamW all else; Muon's step is scaled to
+    AdamW's usual size, so that one learning rate serves both.
     """
     matrices, vectors, orthogonal = [], [], []
     for parameter_name, parameter in network.named_parameters():
