@@ -97,7 +97,8 @@ def run_completion(
         model: the diffusion model.
         config: sampling options.
         done: views of rounds that an interrupted run has generated; these rounds are skipped.
-        first_guess: gives what new cameras see as far as that is known; generation starts from there at ``config.strength``.
+        first_guess: gives what new cameras see as far as that is known; generation starts from there at ``config.strength``, or
+            is told of it, as ``config.guess`` says.
         on_step: called with (round, denoising steps done, steps in all).
         on_found: called with a round that is loaded from the cache.
 
@@ -113,7 +114,8 @@ def run_completion(
         captured = fitted[list(plan.context_of(planned))]
         known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
-        guess = None if first_guess is None or config.strength == 1 else first_guess(planned.cameras)
+        ignored = config.strength == 1 and config.sampling(model.recommended_sampling).guess == "start"
+        guess = None if first_guess is None or ignored else first_guess(planned.cameras)
         current = None if guess is None else Views.cat([*known, guess])
         images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
         origin = Origin(

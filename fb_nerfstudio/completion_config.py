@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from fb_core.inpainter import SamplingConfig
+from fb_core.sampling.options import Guess, SamplingConfig
 
 
 @dataclass
@@ -94,6 +94,9 @@ class CompletionConfig:
     time `strength`. What is asked for in the viewer starts from noise: the splats show what it is to replace."""
     strength: float = 0.5
     """Time from which on the render may change (``start`` render): towards 0 it stays as it is, 1 is noise."""
+    guess: Guess | None = None
+    """How the render enters (``start`` render): as the `start` of the sampling at `strength`, `told` to the model as a guess, or `both`;
+    None is what the model's folder recommends (start where it says nothing). Only models that learned to be told guesses understand them."""
     window: int | None = None
     """Views denoised together, averaged over random windows, for sequences longer than the model likes; None is all of them."""
     memory_budget: float | None = None
@@ -154,7 +157,7 @@ class CompletionConfig:
         """How to sample: these options where they are given, the model's recommendation elsewhere."""
         given = {
             name: getattr(self, name)
-            for name in ("steps", "guidance_unknown", "guidance_known", "window")
+            for name in ("steps", "guidance_unknown", "guidance_known", "window", "guess")
             if getattr(self, name) is not None
         }
         if self.memory_budget is not None:

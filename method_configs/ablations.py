@@ -26,7 +26,7 @@ ROOMS_TINY = Recipe(
     pool=PoolConfig(families=("narrow",), rooms=400, views=20, image_size=64, renewed_per_step=0.25),
     # Busier rooms than the transformer learns from: what an autoencoder blurs, no transformer makes sharp.
     vae_pool=PoolConfig(families=("narrow", "medium"), take_turns=True, rooms=120, views=16, image_size=64, renewed_per_step=0.25),
-    image_vae_loop=LoopConfig(steps=4000, learning_rate=1e-3, warmup_steps=100, cooldown=0.5, average=0.98, optimizer="muon"),
+    image_vae_loop=LoopConfig(steps=2500, learning_rate=1e-3, warmup_steps=100, cooldown=0.5, average=0.98, optimizer="muon"),
     # Starts from a linear codec that is nearly right, which a higher rate would destroy.
     raymap_vae_loop=LoopConfig(steps=1000, learning_rate=1e-4, warmup_steps=100, cooldown=0.5),
     dit_loop=LoopConfig(steps=6400, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
