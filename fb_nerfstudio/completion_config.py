@@ -96,7 +96,7 @@ class CompletionConfig:
     """Time from which on the render may change (``start`` render): towards 0 it stays as it is, 1 is noise."""
     guess: Guess | None = None
     """How the render enters (``start`` render): as the `start` of the sampling at `strength`, `told` to the model as a guess, or `both`;
-    None is what the model's folder recommends (start where it says nothing). Only models that learned to be told guesses understand them."""
+    None is what the model's folder recommends (start where it says nothing). Only models that were trained with guesses understand them."""
     window: int | None = None
     """Views denoised together, averaged over random windows, for sequences longer than the model likes; None is all of them."""
     memory_budget: float | None = None

@@ -22,20 +22,26 @@ ROOMS_TINY = Recipe(
     name="rooms-tiny",
     image_vae=VAEConfig(widths=(16, 32, 64, 64), encoder_resnets=1, decoder_resnets=1, norm="none"),
     raymap_vae=VAEConfig(in_channels=6, widths=(8, 16, 32, 32), encoder_resnets=1, decoder_resnets=1, norm="none", padding="replicate"),
-    dit=DiTConfig(heads=4, head_dim=64, depth=6, text_width=0),
+    dit=DiTConfig(heads=4, head_dim=64, depth=6, text_width=0, ray_frames=True, known_tokens="apart"),
     pool=PoolConfig(families=("narrow",), rooms=400, views=20, image_size=64, renewed_per_step=0.25),
     # Busier rooms than the transformer learns from: what an autoencoder blurs, no transformer makes sharp.
     vae_pool=PoolConfig(families=("narrow", "medium"), take_turns=True, rooms=120, views=16, image_size=64, renewed_per_step=0.25),
     image_vae_loop=LoopConfig(steps=2500, learning_rate=1e-3, warmup_steps=100, cooldown=0.5, average=0.98, optimizer="muon"),
     # Starts from a linear codec that is nearly right, which a higher rate would destroy.
     raymap_vae_loop=LoopConfig(steps=1000, learning_rate=1e-4, warmup_steps=100, cooldown=0.5),
-    dit_loop=LoopConfig(steps=6400, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
+    dit_loop=LoopConfig(steps=16_000, learning_rate=7e-4, warmup_steps=100, optimizer="muon"),
     image_vae_loss=VAELossConfig(batch=16, edges=0.5),
     raymap_vae_loss=VAELossConfig(batch=16),
     # Heading and fill as at inference: a small model has none to spare for what the canonical frame can settle.
     # Guidance over-saturates what so small a model is unsure of (the paper uses 7); without it a step also costs half.
-    sampling=SamplingConfig(steps=16, guidance_unknown=1.0, guidance_known=1.0),
-    dit_loss=DiTLossConfig(batch=8, task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False), ray_weight=0.3),
+    sampling=SamplingConfig(steps=16, guidance_unknown=1.0, guidance_known=1.0, guess="told"),
+    dit_loss=DiTLossConfig(
+        batch=8,
+        draws=2,  # a scene that is encoded, and whose known tokens are computed, is worth two draws of noise
+        pure_noise=0.1,  # so that one step answers with the mean
+        ray_weight=0.3,
+        task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False, guess=0.7),
+    ),
     engine=EngineConfig(precision="auto", draw_ahead=True),  # on two cores data are waited for in 1 % of the time instead of 16 %
 )
 """The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about four hours."""
@@ -43,16 +49,18 @@ ROOMS_TINY = Recipe(
 ROOMS_ABLATION = dataclasses.replace(
     ROOMS_TINY,
     name="rooms-ablation",
-    dit=dataclasses.replace(ROOMS_TINY.dit, heads=2, depth=4),
+    dit=dataclasses.replace(ROOMS_TINY.dit, heads=2, depth=4, ray_frames=False, known_tokens="joint"),  # the paper's design
     # A pool that stays as it is, which designs that take turns can share.
     pool=dataclasses.replace(ROOMS_TINY.pool, rooms=200, views=12, renewed_per_step=0.0),
     dit_loop=dataclasses.replace(ROOMS_TINY.dit_loop, steps=400, learning_rate=2e-3),
-    sampling=dataclasses.replace(ROOMS_TINY.sampling, steps=4),
+    sampling=dataclasses.replace(ROOMS_TINY.sampling, steps=4, guess="start"),
     # The tasks are the paper's, unlike those of rooms-tiny: the designs differ in how raymaps count.
     dit_loss=dataclasses.replace(
         ROOMS_TINY.dit_loss,
+        draws=1,
+        pure_noise=0.0,
         ray_weight=1.0,
-        task=dataclasses.replace(ROOMS_TINY.dit_loss.task, views=8, mixture="quarters", ray_task=0.25),
+        task=dataclasses.replace(ROOMS_TINY.dit_loss.task, views=8, mixture="quarters", ray_task=0.25, guess=0.0),
     ),
 )
 """A transformer of 1 M parameters between the autoencoders of rooms-tiny, for comparing designs on a CPU (``eval ablations``)."""
