@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fb_core.geometry.triangulation import detect, mutual_matches
+from fb_core.masks import resampled
 
 _COARSE_SIDE, _COARSE_LIMIT = 320, 400  # small copies of photos that tell which of them are worth matching
 _FEATURES = 2500
@@ -58,11 +59,13 @@ def features_of(
     places, descriptors, _ = detect(image, known, limit=_FEATURES)
     shrink = min(1.0, _COARSE_SIDE / max(size))
     small = [max(1, round(side * shrink)) for side in size]
+    everything = torch.ones_like(image[:1])
 
-    def shrunk(pixels: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
-        return torch.nn.functional.interpolate(pixels[None], size=small, mode="bilinear", antialias=True)[0]
+    def shrunk(channels: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
+        return torch.nn.functional.interpolate(channels[None], size=small, mode="bilinear", antialias=True)[0]
 
-    coarse = detect(shrunk(image), None if known is None else (shrunk(known) > 0.5).float(), limit=_COARSE_LIMIT)[1]
+    small_image, share = resampled(image, everything if known is None else known, shrunk)
+    coarse = detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
     return PhotoFeatures(places=places, descriptors=descriptors, coarse=coarse, size=size, focal=focal, lens=lens)
 
 
