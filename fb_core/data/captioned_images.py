@@ -138,9 +138,10 @@ def picture_of(sample: dict[str, Any]) -> tuple[Float[Tensor, "3 h w"], Float[Te
         raise ValueError(f"its {suffix} is damaged")
     stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if suffix in _MAY_BE_TRANSPARENT else pixels
     opaque = np.ones(pixels.shape[:2], dtype=np.float32)
-    if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:  # OpenCV's colours of such a file are not upright yet
-        opaque = (stored[:, :, 3] >= np.iinfo(stored.dtype).max / 2).astype(np.float32)
-        pixels = (stored[:, :, :3] / (257 if stored.dtype == np.uint16 else 1)).astype(np.float32)
+    if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
+        stored = stored.astype(np.float32) / (257 if stored.dtype == np.uint16 else 1)
+        opaque = (stored[:, :, 3] >= 127.5).astype(np.float32)
+        pixels = stored[:, :, :3]  # both from the same reading: OpenCV turns opaque pictures alone as their EXIF tags say
     image = rearrange(torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1])), "h w c -> c h w").float() / 255
     return image, torch.from_numpy(opaque)[None]
 
