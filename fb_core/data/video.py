@@ -20,6 +20,8 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.film_colours import to_rgb
+
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp", ".wmv", ".ogv", ".flv")
 _SHARPNESS_SIDE = 480  # pixels of the longer side in which sharpness is measured: motion blur must still be seen
 _MOTION_SIDE = 120  # and motion
@@ -27,7 +29,6 @@ _LEAST_SIDE = 32  # optical flow needs as much
 _NEW_REFERENCE = 0.04  # once the picture has moved by this share of its longer side, motion is measured from here on
 _MOST_STEP = 0.25  # of the longer side: what optical flow says beyond that (a cut) is not believed
 _LEAST_COMPLETE = 0.95  # share of the frames announced by the header that must be there
-_UNTAGGED = 2  # colour space "unspecified"
 _HDR = (16, 18)  # transfer curves PQ and HLG
 _CACHE_BYTES = 256 * 2**20
 _logger = logging.getLogger(__name__)
@@ -311,14 +312,7 @@ def _small_grey(frame: Any) -> np.ndarray:
 def _pixels(frame: Any, display: Display) -> np.ndarray:
     """RGB as shown: uint8 [h, w, 3]."""
     height, width = display.size[::-1] if display.transposed else display.size
-    array = frame.reformat(width=width, height=height, format="rgb24", src_colorspace=_colour_matrix(frame)).to_ndarray()
+    array = to_rgb(frame, height, width)
     array = array.swapaxes(0, 1) if display.transposed else array
     right, down = display.matrix.sum(axis=0)  # of each column one number counts for turns by quarters
     return np.ascontiguousarray(array[:: 1 if down >= 0 else -1, :: 1 if right >= 0 else -1])
-
-
-def _colour_matrix(frame: Any) -> str | None:
-    """How the frame's colours are coded: None = as its tags say; without tags BT.709 for HD films and BT.601 for small ones."""
-    if int(frame.colorspace) != _UNTAGGED:
-        return None
-    return "ITU709" if min(frame.height, frame.width) >= 720 else "ITU601"
