@@ -57,7 +57,8 @@ def to_rgb(frame: Any, height: int, width: int) -> UInt8[np.ndarray, "h w 3"]:
         matrix = usual_matrix(frame.height, frame.width)
     planes, top = _full_size_planes(frame, height, width)
     offset, span = (0, (255, 255, 255)) if is_full else (16, (219, 224, 224))
-    yuv = (planes * np.float32(255 / top) - np.float32([offset, 128, 128])) / np.float32(span)
+    zero, unit = (np.array(values, dtype=np.float32) for values in ((offset, 128, 128), span))
+    yuv = (planes * np.float32(255 / top) - zero) / unit
     return np.rint((yuv @ _to_rgb(matrix).T.astype(np.float32)).clip(0, 1) * 255).astype(np.uint8)
 
 
