@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import io
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +17,8 @@ from torch import Tensor
 from fb_core.data import media
 from fb_core.data.shard_stream import ShardStream, find_shards
 from fb_core.data.training_task import Draw, Sequences, TaskConfig
+from fb_core.json_files import parse_json
+from fb_core.limits import require_decodable
 from fb_core.masks import drop_conditioning, partly_known, wholly_known
 
 _logger = logging.getLogger(__name__)
@@ -132,6 +134,7 @@ def picture_of(sample: dict[str, Any]) -> tuple[Float[Tensor, "3 h w"], Float[Te
         raise ValueError(f"expected a picture ({', '.join(_PICTURES)}), got {sorted(key for key in sample if key[0] != '_')}")
     import cv2
 
+    _require_decodable(suffix, sample[suffix])
     data = np.frombuffer(sample[suffix], dtype=np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if pixels is None:
@@ -146,6 +149,20 @@ def picture_of(sample: dict[str, Any]) -> tuple[Float[Tensor, "3 h w"], Float[Te
     return image, torch.from_numpy(opaque)[None]
 
 
+def _require_decodable(suffix: str, data: bytes) -> None:
+    """Raises ValueError for a picture that is too large, by its header. What is no picture at all is left to the decoder."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+    except Image.DecompressionBombError as error:  # Pillow's own bound is lower than ours
+        raise ValueError(f"its {suffix} has too many pixels ({error}); make it smaller") from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return
+    require_decodable(f"its {suffix}", height, width, 4)
+
+
 def caption_of(sample: dict[str, Any]) -> str:
     """A sample's text: a text file, or "caption" or "text" of a JSON file; empty without any. Raises ValueError for bad JSON."""
     for suffix in _CAPTIONS:
@@ -154,7 +171,7 @@ def caption_of(sample: dict[str, Any]) -> str:
     if "json" not in sample:
         return ""
     try:
-        entry = json.loads(sample["json"])
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        entry = parse_json(sample["json"])
+    except ValueError as error:
         raise ValueError(f"its json is damaged ({error})") from error
     return str(entry.get("caption") or entry.get("text") or "") if isinstance(entry, dict) else ""
