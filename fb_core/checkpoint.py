@@ -20,6 +20,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from fb_core.json_files import read_json
+from fb_core.limits import MOST_SIDE, is_finite, require_between, require_model_sizes
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.released import read_released
 from fb_core.networks.text import TextEncoder
@@ -178,7 +180,7 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
     if not path.is_file():
         raise ValueError(f"folder: {path.parent} is not a model folder because it has no {CONFIG_FILE}.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except ValueError as error:
         raise ValueError(f"{path}: expected JSON, but {error}.") from error
     if not isinstance(content, dict):
@@ -187,6 +189,8 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
     if version != FORMAT_VERSION:
         raise ValueError(f"{path}: expected format_version {FORMAT_VERSION}, got {version}; this may be a newer model.")
     info = content.pop("info", {})
+    if not isinstance(info, dict) or not isinstance(info.get("sampling", {}), dict):
+        raise ValueError(f"{path}: expected info, and sampling in it, to be objects; remove what is not.")
     require_names(str(path), WEIGHT_FILES, content)
     sections: dict[str, Any] = {}
     for name, kind in (("transformer", DiTConfig), ("image_vae", VAEConfig), ("raymap_vae", VAEConfig)):
@@ -195,6 +199,7 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
         expected = {f.name for f in dataclasses.fields(kind)}
         require_names(f"{path}, section {name!r}", expected, content[name].keys() | (_LATER & expected))
         try:
+            require_model_sizes(content[name])  # before anything is built by them
             choices: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()}
             sections[name] = kind(**choices)
         except (TypeError, ValueError) as error:
@@ -203,6 +208,15 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
         return ModelConfig(**sections), info
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def image_size_of(info: dict[str, Any]) -> int:
+    """Side in pixels of the views that a model was trained at, by its info; 256 where that does not say. ValueError for nonsense."""
+    size = info.get("image_size", 256)
+    if not is_finite(size) or size % 1:
+        raise ValueError(f"model: expected a whole number of pixels for image_size, got {size!r}; correct config.json")
+    require_between("model: image_size", size, 16, MOST_SIDE)
+    return int(size)
 
 
 def _open(path: Path, device: torch.device | str):

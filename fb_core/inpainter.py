@@ -77,7 +77,7 @@ class Fillerbuster:
     @property
     def size(self) -> int:
         """Image side in pixels that the model was trained at (256 where the weights do not say)."""
-        return int(self.info.get("image_size", 256))
+        return checkpoint.image_size_of(self.info)
 
     @property
     def device(self) -> torch.device:

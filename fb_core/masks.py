@@ -1,13 +1,20 @@
-"""Known-masks (1 = known): the training mixture, conditioning dropout, growing a hole, scaling to the latent grid."""
+"""Known-masks (1 = known): the training mixture, conditioning dropout, growing a hole, pictures and masks on another grid."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
+
+WHOLLY = 1 - 1e-3
+"""Share of known pixels from which on a resampled pixel counts as known altogether."""
+_LEAST_SHARE = 1e-6  # below, a share is rounding of the resampling, and a colour divided by it would be too
+Resampler = Callable[[Tensor], Tensor]
+"""Takes channels [c, h, w] to channels [c, h2, w2], each channel alike, as means with weights of 0 or more that add up to 1 at most."""
 
 
 def rotated_rectangle(height: int, width: int, *, center: tuple[float, float], size: tuple[float, float], angle_radians: float) -> Tensor:
@@ -79,3 +86,30 @@ def grow_hole(known: Float[Tensor, "n 1 h w"], *, pixels: int) -> Float[Tensor, 
 def to_latent_grid(known: Float[Tensor, "n 1 h w"], *, factor: int = 8) -> Float[Tensor, "n 1 lh lw"]:
     """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples of ``factor``."""
     return F.avg_pool2d(known, kernel_size=factor)
+
+
+def resampled(
+    image: Float[Tensor, "c h w"], known: Float[Tensor, "1 h w"], how: Resampler
+) -> tuple[Float[Tensor, "c h2 w2"], Float[Tensor, "1 h2 w2"]]:
+    """Colours, not multiplied by anything, and the share of each new pixel that is known; colours are black where the share is 0.
+
+    Args:
+        image: any colours; what stands in unknown pixels may be anything, NaN included.
+        known: 1 = known; fractions weigh.
+        how: for example ``lambda channels: media.resize(channels, height, width)``.
+    """
+    known = known.to(image)
+    weighted = torch.where(known > 0, image * known, torch.zeros_like(image))
+    both = how(torch.cat([weighted, known]))
+    share = both[-1:].clamp(0, 1)
+    share = torch.where(share > _LEAST_SHARE, share, torch.zeros_like(share))
+    return torch.where(share > 0, both[:-1] / share.clamp(min=_LEAST_SHARE), torch.zeros_like(share)), share
+
+
+def wholly_known(
+    image: Float[Tensor, "c h w"], known: Float[Tensor, "1 h w"], how: Resampler, *, least: float = WHOLLY
+) -> tuple[Float[Tensor, "c h2 w2"], Float[Tensor, "1 h2 w2"]]:
+    """Like :func:`resampled`, for what networks see and splats learn: 1 where a share of at least ``least`` is known, else black and 0."""
+    colours, share = resampled(image, known, how)
+    whole = (share >= least).to(share)
+    return torch.where(whole > 0, colours, torch.zeros_like(colours)), whole

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,6 +18,7 @@ from torch import Tensor
 from fb_core.checkpoint import ModelConfig, autoencoder_dtype
 from fb_core.conditioning import CONDITIONING_CHANNELS, LATENT_CHANNELS, STATE_CHANNELS, decode_in_chunks, encode_in_chunks
 from fb_core.live_bytes import LiveBytes
+from fb_core.machine import free_memory_bytes
 from fb_core.networks.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.prepared import Prepared
 from fb_core.networks.text import WORDS
@@ -143,17 +143,14 @@ def bound(
 
 
 def available_bytes(device: torch.device) -> int | None:
-    """Memory that is free on a device, with what torch holds in reserve there; None where it cannot be told."""
+    """Memory that is free on a device, with what torch holds in reserve there; None where it cannot be told.
+
+    Beside a CPU it is what this process may still take, within the limits of containers too.
+    """
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    table = Path("/proc/meminfo")
-    if device.type != "cpu" or not table.exists():
-        return None
-    for line in table.read_text().splitlines():
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    return None
+    return free_memory_bytes() if device.type == "cpu" else None
 
 
 def _padded(size: tuple[int, int]) -> tuple[int, int]:

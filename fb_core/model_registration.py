@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.media import resize
 from fb_core.data.photo_choice import choose_by_coverage
 from fb_core.data.photos import Photo
 from fb_core.geometry.cameras import Pinholes
@@ -19,6 +19,7 @@ from fb_core.geometry.paths import spread_subset
 from fb_core.geometry.pose_solver import PoseSolving, Verdict, recover_cameras
 from fb_core.geometry.raymap import raymaps_of
 from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.masks import wholly_known
 from fb_core.views import Views
 
 ROUNDS = 8
@@ -34,18 +35,19 @@ class Square:
     """The centred square of a photo at the model's size, and its way back."""
 
     image: Float[Tensor, "3 s s"]
+    """RGB in [0, 1], black where it is not known."""
     known: Float[Tensor, "1 s s"]
+    """1 = known, else 0."""
     whole: tuple[int, int]
     """(height, width) of the photo, pixels."""
 
     @staticmethod
     def of(photo: Photo, side: int) -> Square:
-        """The square spans the photo's shorter side."""
-        image, known = photo.load_with_mask()
+        """The square spans the photo's shorter side. What is opaque by half or more is known, as in the capture that is written."""
         left, top, short = _window(photo.size)
-        both = torch.cat([image, known])[:, top : top + short, left : left + short]
-        both = F.interpolate(both[None], size=(side, side), mode="bilinear", antialias=True, align_corners=False)[0]
-        return Square(image=both[:3].clamp(0, 1), known=both[3:].clamp(0, 1), whole=photo.size)
+        image, known = (pixels[:, top : top + short, left : left + short] for pixels in photo.load_with_mask())
+        image, known = wholly_known(image, (known >= 0.5).to(image), lambda channels: resize(channels, side, side))
+        return Square(image=image.clamp(0, 1), known=known, whole=photo.size)
 
     @property
     def side(self) -> int:

@@ -13,6 +13,7 @@ from torch import Tensor
 from fb_core.data.captures import Frame
 from fb_core.data.media import resize
 from fb_core.geometry.cameras import Pinholes
+from fb_core.masks import wholly_known
 from fb_nerfstudio.completed_views import BROUGHT, CompletedViews, Origin
 from fb_nerfstudio.completion import fitted_rectangle
 from fb_nerfstudio.completion_config import CompletionConfig
@@ -49,7 +50,7 @@ def brought_views(frames: Sequence[Frame], *, number: int, size: int | None = No
     views = torch.stack(pictures)
     return CompletedViews(
         images=rearrange((views[:, :3].clamp(0, 1) * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous(),
-        masks=rearrange(views[:, 3:] > 0.999, "n 1 h w -> n h w 1").contiguous(),
+        masks=rearrange(views[:, 3:] > 0, "n 1 h w -> n h w 1").contiguous(),
         cameras=Pinholes.cat(list(cameras)),
         origins=tuple(_origin(frame, number) for frame in frames),
     )
@@ -59,7 +60,8 @@ def _fitted(picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int) -> tup
     """Colours and mask in the middle of a square; the mask is 0 around them."""
     left, top, width, height = fitted_rectangle(camera.height, camera.width, side)
     pads = (left, side - width - left, top, side - height - top)
-    return F.pad(resize(picture, height, width), pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
+    fitted = torch.cat(wholly_known(picture[:3], picture[3:], lambda channels: resize(channels, height, width)))
+    return F.pad(fitted, pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
 
 
 def _origin(frame: Frame, number: int) -> Origin:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, Literal
 
@@ -12,9 +14,37 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.masks import WHOLLY
 from fb_nerfstudio.bridge import batch_image, batch_known, to_pinhole_list
 from fb_nerfstudio.completion import CapturedView
 from fb_nerfstudio.unseen import coarse_mask
+
+
+@contextmanager
+def _known_as_alpha(dataset: InputDataset) -> Iterator[None]:
+    """Meanwhile pictures of a dataset that have alpha, or a mask and a lens that bends, tell by alpha alone what is known.
+
+    So whatever resamples a picture resamples its mask alike. What stands in unknown pixels of a bent picture is black then.
+    """
+    read = dataset.get_data
+
+    def get_data(image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        data = read(image_idx, image_type)
+        lens, image = dataset.cameras[image_idx].distortion_params, data["image"]
+        bent = lens is not None and bool((lens != 0).any())
+        if image.shape[-1] != 4 and not (bent and "mask" in data):
+            return data
+        known = batch_known(data).movedim(0, -1) >= 0.5
+        data.pop("mask", None)
+        rgb = image[..., :3] * known if bent else image[..., :3]
+        alpha = known.to(image.dtype) * (255 if image.dtype == torch.uint8 else 1)
+        return data | {"image": torch.cat([rgb, alpha], dim=-1)}
+
+    dataset.get_data = get_data
+    try:
+        yield
+    finally:
+        del dataset.get_data
 
 
 class CapturedViewsDatamanager(FullImageDatamanager[InputDataset]):
@@ -47,14 +77,16 @@ class CapturedViewsDatamanager(FullImageDatamanager[InputDataset]):
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict[str, torch.Tensor]]:
         """As in nerfstudio, but alpha becomes part of the mask (transparent is unknown), for training, evaluation and context alike.
 
+        Where a lens is undistorted, pixels that unknown ones were mixed into are unknown too; nerfstudio calls them known.
         Without CUDA images stay in ordinary memory, where nerfstudio would pin them and crash.
         """
         if cache_images_device == "cpu" and torch.device(self.device).type != "cuda":
             cache_images_device = "gpu"  # means "on self.device"
-        loaded = super()._load_images(split, cache_images_device)
+        with _known_as_alpha(self.train_dataset if split == "train" else self.eval_dataset):
+            loaded = super()._load_images(split, cache_images_device)
         for data in loaded:
             if data["image"].shape[-1] == 4:
-                data["mask"] = batch_known(data).movedim(0, -1) >= 0.5
+                data["mask"] = batch_known(data).movedim(0, -1) >= WHOLLY
                 data["image"] = data["image"][..., :3].contiguous()
         return loaded
 

@@ -16,9 +16,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from fb_core.data.media import resize
 from fb_core.duration import in_words
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
+from fb_core.masks import wholly_known
 from fb_core.views import Views
 from fb_nerfstudio.completed_views import ANCHOR, CompletedViews, Origin
 from fb_nerfstudio.completion_cache import CompletionCache, round_key
@@ -187,13 +189,7 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     """
     _, height, width = view.image.shape
     left, top, new_width, new_height = fitted_rectangle(height, width, size)
-    known = view.known.to(view.image)
-    content = torch.cat([torch.where(known > 0, view.image, torch.zeros_like(view.image)) * known, known])
-    if (new_height, new_width) != (height, width):
-        content = F.interpolate(content[None], size=(new_height, new_width), mode="bilinear", antialias=True, align_corners=False)[0]
-    share = content[3:]
-    known = (share > 0.999).to(content)
-    image = torch.where(known > 0, content[:3] / share.clamp(min=1e-6), torch.zeros_like(content[:3]))
+    image, known = wholly_known(view.image, view.known, lambda channels: resize(channels, new_height, new_width))
     pads = (left, size - new_width - left, top, size - new_height - top)
     camera = view.camera.scaled(new_width, new_height).cropped(-left, -top, size, size)
     return Views.known(F.pad(image, pads)[None], camera, mask=F.pad(known, pads)[None])

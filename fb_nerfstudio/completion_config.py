@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_STEPS, MOST_VIEWS, require_between
 from fb_core.sampling.options import Guess, SamplingConfig
 
 
@@ -121,17 +122,21 @@ class CompletionConfig:
     """At most this many of them."""
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("at_step", 0),
-            ("context_views", 1),
-            ("anchor_views", 0),
-            ("densify_rounds", 0),
-            ("densify_views", 0),
-            ("steps", 2),
-            ("window", 1),
+        for name, least, most in (
+            ("at_step", 0, MOST_TRAINING_STEPS),
+            ("context_views", 1, MOST_VIEWS),
+            ("anchor_views", 0, MOST_VIEWS),
+            ("densify_rounds", 0, MOST_VIEWS),
+            ("densify_views", 0, MOST_VIEWS),
+            ("steps", 2, MOST_SAMPLING_STEPS),
+            ("window", 1, MOST_VIEWS),
         ):
-            if getattr(self, name) is not None and getattr(self, name) < least:
-                raise ValueError(f"completion.{name}: expected at least {least}, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"completion.{name}: expected at least {least}, got {value}")
+            require_between(f"completion.{name}", least if value is None else value, least, most)
+        new = self.anchor_views + self.densify_rounds * self.densify_views
+        require_between("completion: anchor_views and densify_rounds times densify_views together", new, 0, MOST_VIEWS)
         if self.inpainter == "diffusion" and self.inpainter_weights is not None:
             raise ValueError(
                 "completion.inpainter_weights: weights of a 2D inpainter need completion.inpainter grid; set it, or leave them out"
@@ -144,6 +149,7 @@ class CompletionConfig:
             raise ValueError("completion.camera_path: inpainting places no camera; set completion.task new-views, or leave the path out")
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
+        require_between("completion.image_size", self.image_size or 16, 16, MOST_SIDE)
         if not 0.0 <= self.generated_share <= 1.0:
             raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
         if not 0.0 < self.strength <= 1.0:

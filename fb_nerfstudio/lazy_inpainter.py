@@ -27,7 +27,7 @@ class LazyInpainter:
     @property
     def size(self) -> int:
         """Image side in pixels that the model was trained at."""
-        return int(self._info.get("image_size", 256))
+        return checkpoint.image_size_of(self._info)
 
     @property
     def recommended_sampling(self) -> SamplingConfig:

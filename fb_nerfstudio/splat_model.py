@@ -21,8 +21,9 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.normals import normal_picture, normals_from_depth, normals_of_picture
+from fb_core.masks import resampled
 from fb_nerfstudio import photometric
-from fb_nerfstudio.bridge import flip_axes, to_pinholes
+from fb_nerfstudio.bridge import batch_image, flip_axes, to_pinholes
 from fb_nerfstudio.densification import CappedStrategy, append_rows
 from fb_nerfstudio.gaussians import evenly_chosen, gaussians_at, random_points
 from fb_nerfstudio.lazy_lpips import LazyLpips
@@ -383,7 +384,13 @@ class FillerbusterSplatModel(SplatfactoModel):
         return 0.1 * (log_ratio.exp() - self.config.max_gauss_ratio).clamp_min(0.0).mean()
 
     def _target(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> Float[Tensor, "h w 3"]:
-        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        """The batch's picture at the current resolution."""
+        image = batch["image"]
+        if "mask" in batch and image.shape[-1] == 3 and self._get_downscale_factor() > 1:  # unknown colours must not be mixed in
+            mask = batch["mask"].reshape(1, *image.shape[:2]).float()
+            smaller = resampled(batch_image(batch), mask, lambda both: self._downscale_if_required(both.movedim(0, -1)).movedim(-1, 0))
+            return smaller[0].movedim(0, -1).to(self.device)
+        return self.composite_with_background(self.get_gt_img(image), outputs["background"])
 
     def _known(self, batch: dict[str, Any]) -> Float[Tensor, "h w 1"] | None:
         """The batch's mask at the current resolution; fractions where a block is known in part."""

@@ -19,6 +19,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import CaptureShape
 from fb_core.geometry.shell import intersect
 from fb_core.geometry.triangulation import Features, detect, triangulate
+from fb_core.masks import wholly_known
 from fb_nerfstudio.bridge import to_pinholes
 from fb_nerfstudio.completion_plan import shell_of
 
@@ -66,9 +67,10 @@ class _Photo:
         masks = [] if alpha is None else [alpha]
         if outputs.mask_filenames is not None:
             masks.append(read_image(outputs.mask_filenames[index], apply_orientation=False)[:1])
-        known = torch.stack([(resize(mask, height, width) > 0.999).float() for mask in masks]).amin(dim=0) if masks else None
+        known = torch.stack([(mask >= 0.5).to(image) for mask in masks]).amin(dim=0) if masks else torch.ones_like(image[:1])
+        image, known = wholly_known(image, known, lambda channels: resize(channels, height, width))
         camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)
-        return cls(resize(image, height, width).clamp(0, 1), known, camera, *lens)
+        return cls(image.clamp(0, 1), known if masks else None, camera, *lens)
 
     def world_directions(self, places: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
         return straight_directions(places, self.camera, self.model, self.distortion) @ self.camera.rotations[0].T

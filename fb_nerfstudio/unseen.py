@@ -20,6 +20,7 @@ from torch import Tensor
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import seen_by
 from fb_core.geometry.shell import Shell, intersect
+from fb_core.masks import resampled
 from fb_nerfstudio.bridge import to_nerfstudio
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.seams import without_seams
@@ -162,7 +163,7 @@ def with_matched_colors(views: CompletedViews, unseen: Unseen, rendered: Rendere
     images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
     size = images.shape[2:]
     reliable = ~unseen.mask & (rendered.accumulation >= _OPAQUE)
-    colors = F.interpolate(rendered.rgb, size=size, mode="bilinear", align_corners=False)
+    colors = torch.stack([_enlarged(rgb, there, size) for rgb, there in zip(rendered.rgb, reliable, strict=True)])
     matched = without_seams(images, colors, _at_size(reliable, size)[:, 0])
     return dataclasses.replace(views, images=rearrange((matched * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous())
 
@@ -171,6 +172,15 @@ def with_unseen_masks(views: CompletedViews, unseen: Unseen) -> CompletedViews:
     """The views with masks that leave only unseen pixels of what they left. No seam: generated pixels would blur captured ones."""
     masks = _at_size(unseen.mask, views.images.shape[1:3])
     return dataclasses.replace(views, masks=rearrange(masks, "n 1 h w -> n h w 1") & views.masks)
+
+
+def _enlarged(rgb: Float[Tensor, "3 h w"], reliable: Bool[Tensor, "h w"], size: Sequence[int]) -> Float[Tensor, "3 height width"]:
+    """The splats' reliable colours at the size (height, width) of the pictures; others are not mixed in."""
+
+    def enlarged(channels: Float[Tensor, "c h w"]) -> Float[Tensor, "c height width"]:
+        return F.interpolate(channels[None], size=tuple(size), mode="bilinear", align_corners=False)[0]
+
+    return resampled(rgb, reliable[None].to(rgb), enlarged)[0]
 
 
 def _at_size(mask: Bool[Tensor, "n h w"], size: Sequence[int]) -> Bool[Tensor, "n 1 height width"]:

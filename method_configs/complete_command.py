@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from fb_core.geometry.camera_paths import PATHS, path_cameras
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
+from fb_core.machine import peak_memory_bytes
 from method_configs.complete_options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.complete_output import COMMAND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
@@ -291,4 +291,4 @@ def _peak_memory_gib() -> float:
     """Of this process, from its start; with a GPU, of the GPU."""
     if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
         return torch.cuda.max_memory_allocated() / 2**30
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return peak_memory_bytes() / 2**30

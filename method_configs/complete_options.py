@@ -9,6 +9,7 @@ from typing import Literal
 
 from fb_core.fly_through import Passes, plan_passes, room_beside
 from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.model_registration import ROUNDS
 
 CHECKED = 8
@@ -55,10 +56,17 @@ class CompleteOptions:
     """Look for the cameras of photos and new views once more, and report how far they are off."""
 
     def __post_init__(self) -> None:
-        for name, least in (("views", 1), ("photos", 1), ("sequence", 2), ("size", 16), ("steps", 1)):
+        for name, least, most in (
+            ("views", 1, MOST_VIEWS),
+            ("photos", 1, MOST_VIEWS),
+            ("sequence", 2, MOST_VIEWS),
+            ("size", 16, MOST_SIDE),
+            ("steps", 1, MOST_SAMPLING_STEPS),
+        ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
+            require_between(name, value or least, least, most)
         if not 0 < self.fps <= 240:
             raise ValueError(f"fps: expected between 0 and 240 pictures per second, got {self.fps:g}")
 

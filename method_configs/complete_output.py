@@ -22,6 +22,7 @@ from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
 from fb_core.fly_through import FoundCameras
 from fb_core.geometry.cameras import Pinholes
+from fb_core.json_files import read_json
 
 REPORT_NAME = "report.json"
 COMMAND = "fillerbuster complete"
@@ -93,7 +94,7 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
 def is_ours(folder: Path) -> bool:
     """Whether this command made the folder."""
     try:
-        report = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
+        report = read_json(folder / REPORT_NAME)
     except (OSError, ValueError):
         return False
     return isinstance(report, dict) and report.get("command") == COMMAND

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import threading
 import time
@@ -19,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from fb_core.machine import usable_cores
 from method_configs.training_process import TrainingProcess
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def training_arguments(output: Path, method: str, *, seed: int, iterations: int,
 
 def _train_both(output: Path, *, seed: int, iterations: int, model: Path | None, bars: _Bars) -> dict[str, float]:
     """Run both trainings at once, each on half of the cores; returns the seconds of their stages."""
-    threads = max(1, len(os.sched_getaffinity(0)) // 2)
+    threads = max(1, usable_cores() // 2)
     (output / "runs").mkdir()
     started: dict[str, TrainingProcess] = {}
     try:

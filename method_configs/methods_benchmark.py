@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
 import shutil
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from fb_core.machine import usable_cores
 from method_configs.demo import FAMILY, run_folder, training_arguments
 from method_configs.training_process import TrainingProcess
 
@@ -205,7 +205,7 @@ def trained(method: str, folder: Path, room: int, config: Methods) -> dict[str, 
     import psutil
 
     (folder / "runs").mkdir(exist_ok=True)
-    threads = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1))
+    threads = usable_cores()
     process = TrainingProcess(
         arguments_of(method, folder, room, config),
         log=folder / "runs" / f"{method}.log",

@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from fb_core.data.training_data import TrainingData
+from fb_core.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.training.distributed import Group, joined
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.loop import EngineConfig, OnProgress
@@ -67,6 +68,7 @@ def train_preset(
     data = TrainingData(captures=captures, meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips)
     recipe = dataclasses.replace(_recipe(preset), data=data, start_from=start_from)
     _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
+    require_between("steps", steps or 1, 1, MOST_TRAINING_STEPS)
     stages = STAGES if stage == "all" else (stage,)
     chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
     flags = {"recompute": recompute, "shard": shard, "tensorboard": tensorboard}

@@ -332,6 +332,13 @@ def test_released_files_that_are_missing_truncated_or_strange(released, tmp_path
         (lambda: torch.save({"transformer_state_dict": state | {"module.rope": torch.zeros(1)}}, path), "got unknown rope"),
         (lambda: torch.save({"transformer_state_dict": state | {first: torch.zeros(16)}}, path), r"got shape \[16\]"),
         (lambda: torch.save({"transformer_state_dict": {k: v for k, v in state.items() if k != last}}, path), "proj_out_2.weight"),
+        (lambda: torch.save({"transformer_state_dict": state | {last: state[last].long()}}, path), "numbers, got int64"),
+        (lambda: torch.save({"transformer_state_dict": state | {last: state[last].to_sparse()}}, path), "got a sparse_coo one"),
+        (lambda: torch.save({"transformer_state_dict": state | {last: state[last].to(torch.cfloat)}}, path), "got complex64"),
+        (lambda: torch.save({"transformer_state_dict": state | {7: torch.zeros(1)}}, path), "names of weights, got the key 7"),
+        (lambda: torch.save({"transformer_state_dict": state | {("a", 1): torch.zeros(1)}}, path), "got the key .'a', 1."),
+        (lambda: torch.save({"transformer_state_dict": state | {last[7:]: state[last]}}, path), "same name but for wrappers"),
+        (lambda: torch.save({"transformer_state_dict": state | {first: torch.zeros(1, 1, 1, 1).expand(2**30, 66, 2, 2)}}, path), "repeats"),
         (path.unlink, r"has no transformer.ckpt; all of"),
     ]:
         change()

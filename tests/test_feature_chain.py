@@ -12,7 +12,7 @@ from fb_core.evaluation.pose_metrics import pose_errors
 from fb_core.geometry.bundle_adjustment import Bundle, _jacobians, adjust
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.feature_chain import chain
-from fb_core.geometry.feature_pairs import PhotoFeatures, features_of
+from fb_core.geometry.feature_pairs import PhotoFeatures, features_of, match_pairs, verified_pair
 from fb_core.geometry.pose_refine import rotation_of
 from fb_core.geometry.pose_verdict import Arrangement
 
@@ -112,6 +112,54 @@ def test_wrong_matches_and_noise_are_borne():
     truth = around(6)
     result = errors(chain(seen(truth, cloud(500), told=500.0, noise=0.4, wrong=0.25)), truth)
     assert result["found_share"] == 1.0 and result["rotation_degrees"] < 0.2 and result["center"] < 0.02
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("noise", [0.03, 0.2])
+def test_two_photos_of_little_but_a_wall_have_the_right_motion(seed: int, noise: float):
+    """Within a pixel of tolerance a wrong motion explains a wall as well, but puts half of it behind a camera."""
+    generator = np.random.default_rng(seed)
+    focal, size = 104.0, (120, 160)
+    wall = np.stack([*generator.uniform([[-1.6], [-1.2]], [[1.6], [1.2]], (2, 220)), np.full(220, 2.5)], axis=1)
+    wall[::12, 2] -= 0.15  # some of it stands out a little
+    angle = math.radians(generator.uniform(12, 30))
+    rotation = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
+    shift = np.array([2.2 * math.sin(angle), 0.1, 2.2 * (1 - math.cos(angle))])  # around the wall's middle
+    both = [points[:, :2] / points[:, 2:] * focal for points in (wall, wall @ rotation.T + shift)]
+    photos = [
+        PhotoFeatures(
+            places=torch.from_numpy(offsets + noise * generator.normal(size=offsets.shape) + [80, 60]).float(),
+            descriptors=torch.eye(220),
+            coarse=torch.zeros(0, 220),
+            size=size,
+            focal=focal,
+            lens="a",
+        )
+        for offsets in both
+    ]
+    every = np.arange(220).repeat(2).reshape(-1, 2)
+    pair = verified_pair(photos, (0, 1), every, [focal, focal])
+    assert pair is not None and len(pair.matches) > 200
+    turn = math.degrees(math.acos(min(1.0, (np.trace(pair.rotation @ rotation.T) - 1) / 2)))
+    assert turn < (0.6 if noise < 0.1 else 4)
+
+
+def test_an_assertion_that_fails_within_opencv_ends_nothing(monkeypatch: pytest.MonkeyPatch):
+    """OpenCV 4.10 fails one in findFundamentalMat on some matches of good photos."""
+    import cv2
+
+    original, asked = cv2.findFundamentalMat, []
+
+    def failing(first, second, method, *rest):
+        asked.append(method)
+        if method == cv2.USAC_MAGSAC:
+            raise cv2.error("(-215:Assertion failed) !model.empty() in function 'setModelParameters'")
+        return original(first, second, method, *rest)
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", failing)
+    photos = seen(around(3), cloud(120))
+    found = match_pairs(photos, lambda done, total: None)
+    assert cv2.USAC_MAGSAC in asked and len(found) == 3 and all(len(matches) > 60 for matches in found.values())
 
 
 def test_the_order_of_photos_only_changes_the_world():

@@ -214,3 +214,40 @@ def test_photometric_figures_are_of_known_pixels():
     changed = torch.where(known > 0, first, 1 - first)
     for figure in (photometric.l1, photometric.psnr, photometric.ssim):
         assert float(figure(first, second, known)) == pytest.approx(float(figure(changed, second, known)))
+
+
+@pytest.mark.parametrize("told", ["masks", "alpha"])
+@pytest.mark.parametrize("lens", [{"k1": -0.2, "p1": 0.01}, {"k1": 0.05, "k2": 0.01, "camera_model": "OPENCV_FISHEYE"}])
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_a_bent_picture_of_one_colour_keeps_it_where_it_is_known(tiny_capture: Path, told: str, lens: dict, kind: str):
+    """Undistortion mixes neighbours: what unknown ones were mixed into is unknown, on the way to splats and to the model."""
+    content, colour = json.loads((tiny_capture / "transforms.json").read_text()), torch.tensor([51, 178, 102])
+    capture = read_capture(tiny_capture)
+    for entry, frame in zip(content["frames"], capture.frames, strict=True):
+        known = frame.load_mask()
+        loud = torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+        picture = torch.where(known > 0, colour[:, None, None] / 255, loud).expand(3, 32, 48)
+        if told == "alpha":
+            entry.pop("mask_path", None)
+            _write_rgba(tiny_capture / entry["file_path"], torch.cat([picture, known]))
+        else:
+            media.write_image(tiny_capture / entry["file_path"], picture)
+    (tiny_capture / "transforms.json").write_text(json.dumps(content | lens))
+    manager = make(tiny_capture, start_points=0, cache_images_type=kind)
+    holes = 0
+    for index, data in enumerate(manager.cached_train):
+        image = data["image"].float() * (1 if kind == "uint8" else 255)
+        mask = data["mask"][..., 0]
+        assert image.shape[-1] == 3 and mask.shape == image.shape[:2] and float(mask.float().mean()) > 0.6
+        assert float((image[mask] - colour).abs().max()) <= 1, "a pixel of another colour counts as known"
+        holes += int(not bool(mask[6:-6, 6:-6].all()))
+        view = fitted_view(manager.captured_view(index, manager.captured_cameras()[index]), 24)
+        there = view.image_known[0, 0] > 0
+        assert float((255 * view.images[0][:, there].T - colour).abs().max()) <= 1
+    assert holes >= 2
+
+
+def _write_rgba(path: Path, rgba: torch.Tensor) -> None:
+    from PIL import Image
+
+    Image.fromarray((rgba * 255).round().to(torch.uint8).movedim(0, -1).contiguous().numpy()).save(path)

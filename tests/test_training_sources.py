@@ -24,7 +24,7 @@ from fb_core.data.ray_caster import render
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, make_room
 from fb_core.data.sequences import PoolConfig, RoomPool
-from fb_core.data.training_data import Resolution, TrainingData, multi_view_source, resolution_of
+from fb_core.data.training_data import Resolution, TrainingData, at_resolutions, multi_view_source, resolution_of
 from fb_core.data.training_task import Source, TaskConfig
 from fb_core.data.triangle_caster import cast_triangles
 from fb_core.sampling.randomness import generator_of
@@ -336,11 +336,53 @@ def test_named_folders_replace_rooms(tiny_capture, meshes):
     assert len(multi_view_source(TrainingData(captures=tiny_capture, meshes=meshes, rooms=True), pool, seed=0).sources) == 3
 
 
-def test_resolutions_are_assigned_evenly():
+def test_resolutions_have_equal_odds():
     from method_configs.ablations import PAPER
 
-    drawn = [resolution_of(PAPER.resolutions, seed=0, rank=rank) for rank in range(1000)]
-    assert all(150 < drawn.count(one) < 250 for one in PAPER.resolutions)
+    drawn = [resolution_of(PAPER.resolutions, seed=0, step=step) for step in range(1000)]
+    assert all(drawn.count(one) == 200 for one in PAPER.resolutions)
+    assert all(20 < drawn[::5].count(one) < 60 for one in PAPER.resolutions), "in a random order"
+    assert drawn != [resolution_of(PAPER.resolutions, seed=1, step=step) for step in range(1000)]
+
+
+RESOLUTIONS = (
+    Resolution(image_size=16, views=3, sequences=2, images=4),
+    Resolution(image_size=32, views=2, images=4),
+    Resolution(image_size=48, views=1, images=4),
+)
+
+
+def resolved_source(shards=None) -> Source:
+    pool = PoolConfig(rooms=4, views=4, image_size=32, supersample=1, renewed_per_step=0.5)
+    data = TrainingData(images=None if shards is None else str(shards))
+    share = 0.0 if shards is None else 0.5
+    first = multi_view_source(data, pool, seed=3)
+    return at_resolutions(first, RESOLUTIONS, 2, data, pool, single_share=share, seed=3)
+
+
+@pytest.mark.parametrize("singles", [False, True])
+def test_any_number_of_processes_sees_the_same_resolutions_and_rows(shards, singles):
+    """A step's size is a function of (seed, step), whoever asks for which rows, and wherever a training is resumed."""
+    batch, sizes = 4, []
+    alone = resolved_source(shards if singles else None)
+    shared = {w: [resolved_source(shards if singles else None) for _ in range(w)] for w in (2, 4)}
+    for step in range(9):
+        alone.advance(step, range(batch))
+        whole = alone.sequences(range(batch), TASK, draws(step))
+        sizes.append(whole.images.shape[-1])
+        each = len(whole.images) // batch
+        for count, sources in shared.items():
+            for rank, source in enumerate(sources):
+                rows = range(rank, batch, count)
+                source.advance(step, rows)
+                part = source.sequences(rows, TASK, draws(step))
+                mine = [row * each + k for row in rows for k in range(each)]
+                assert torch.equal(part.images, whole.images[mine]) and torch.equal(part.raymaps, whole.raymaps[mine])
+                assert torch.equal(part.image_known, whole.image_known[mine])
+    assert sizes[:2] == [32, 32] and sorted(sizes[2:5]) == sorted(sizes[5:8]) == [16, 32, 48]
+    resumed = resolved_source(shards if singles else None)
+    resumed.advance(8, range(batch))
+    assert_same(resumed.sequences(range(batch), TASK, draws(8)), whole)
 
 
 def test_all_three_stages_learn_from_captures_and_captioned_pictures(tiny_capture, shards, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,11 @@ import torch
 
 from fb_core.data.transforms_json import to_opengl
 from fb_core.geometry.cameras import Pinholes
+from fb_core.json_files import read_json
+from fb_core.limits import MOST_VIEWS
 
 _LEAST_DEGREES, _MOST_DEGREES = 1.0, 170.0
+_MOST_BYTES = 2**26  # of a file: 6 KiB for each of the most cameras
 _ORTHONORMAL = 1e-3  # most that a rotation's columns may be off
 
 
@@ -47,6 +49,8 @@ def read_camera_path(path: Path, *, size: int) -> CameraPath:
     entries = content["camera_path"]
     if not isinstance(entries, list) or not entries:
         raise ValueError(f"camera path {path}: it has no cameras; add keyframes in the viewer's Render tab and save it again")
+    if len(entries) > MOST_VIEWS:
+        raise ValueError(f"camera path {path}: expected at most {MOST_VIEWS} cameras, got {len(entries)}; save it with fewer per second")
     poses = torch.stack([_pose(entry, index, path) for index, entry in enumerate(entries)])
     degrees = torch.tensor([_field_of_view(entry, index, path) for index, entry in enumerate(entries)], dtype=torch.float64)
     focal = 0.5 * height / torch.tan(torch.deg2rad(degrees) / 2) * size / max(width, height)
@@ -64,9 +68,9 @@ def _load(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"camera path {path}: no such file; save a path in the viewer's Render tab, or check the name")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError):
-        raise ValueError(f"camera path {path}: not a JSON file; save a path in the viewer's Render tab") from None
+        content = read_json(path, most_bytes=_MOST_BYTES)
+    except ValueError as error:
+        raise ValueError(f"camera path {path}: not a JSON file of a path ({error}); save one in the viewer's Render tab") from None
     needed = ("camera_path", "render_width", "render_height")
     if not isinstance(content, dict) or any(key not in content for key in needed):
         got = f"the keys {', '.join(sorted(map(str, content))[:6]) or 'none'}" if isinstance(content, dict) else type(content).__name__

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import io
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,11 +17,14 @@ from torch import Tensor
 from fb_core.data import media
 from fb_core.data.shard_stream import ShardStream, find_shards
 from fb_core.data.training_task import Draw, Sequences, TaskConfig
-from fb_core.masks import drop_conditioning, partly_known
+from fb_core.json_files import parse_json
+from fb_core.limits import require_decodable
+from fb_core.masks import drop_conditioning, partly_known, wholly_known
 
 _logger = logging.getLogger(__name__)
 _READERS = 8  # rows read at a time
 _PICTURES = ("jpg", "jpeg", "png", "webp")
+_MAY_BE_TRANSPARENT = ("png", "webp")
 _CAPTIONS = ("txt", "caption", "text")
 
 
@@ -73,13 +76,14 @@ class CaptionedImages:
     def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
         """``per_row`` sequences of one view for each row; rays are neither known nor true."""
         parts = [part for row in self._readers.map(lambda row: self._row(row, rows.stop, task, draw(row)), rows) for part in row]
-        images, known = (torch.stack([part[name] for part in parts])[:, None].to(self.device) for name in ("image", "known"))
+        images, truth, known = (torch.stack([part[n] for part in parts])[:, None].to(self.device) for n in ("image", "truth", "known"))
         nothing = torch.zeros_like(known)
         return Sequences(
             images=images,
             raymaps=nothing.expand(-1, -1, 6, -1, -1),
-            image_known=known,
+            image_known=known * truth,
             rays_known=nothing,
+            image_truth=None if bool((truth == 1).all()) else truth,
             rays_truth=nothing,
             captions=tuple(part["caption"] for part in parts),
         )
@@ -97,18 +101,23 @@ class CaptionedImages:
         """Picture and caption; a broken sample is told in the log, and others of its row take its place, so that positions stay."""
         place = torch.rand(3, generator=generator).tolist()
         try:
-            return {"image": self._crop(picture_of(sample), place), "caption": caption_of(sample)}
+            image, truth = self._crop(*picture_of(sample), place)
+            return {"image": image, "truth": truth, "caption": caption_of(sample)}
         except ValueError as error:
             _logger.warning("left out sample %s of shard %s: %s", sample.get("__key__"), sample.get("__url__"), error)
             return None
 
-    def _crop(self, image: Float[Tensor, "3 h w"], place: list[float]) -> Float[Tensor, "3 size size"]:
+    def _crop(
+        self, image: Float[Tensor, "3 h w"], truth: Float[Tensor, "1 h w"], place: list[float]
+    ) -> tuple[Float[Tensor, "3 size size"], Float[Tensor, "1 size size"]]:
         size = self.config.image_size
         height, width = image.shape[1:]
         height, width = (max(size, round(side * size / min(height, width))) for side in (height, width))
         shares = (0.5, 0.5) if place[0] < self.config.centered else place[1:]
         top, left = (int(share * (side - size) + 0.5) for share, side in zip(shares, (height, width), strict=True))
-        return media.resize(image, height, width)[:, top : top + size, left : left + size].clamp(0, 1)
+        image, truth = wholly_known(image, truth, lambda channels: media.resize(channels, height, width))
+        cut = (slice(None), slice(top, top + size), slice(left, left + size))
+        return image[cut].clamp(0, 1), truth[cut]
 
     def _known(self, task: TaskConfig, generator: torch.Generator) -> Float[Tensor, "1 h w"]:
         size = self.config.image_size
@@ -118,17 +127,40 @@ class CaptionedImages:
         return known * (not unknown) * (not dropped)
 
 
-def picture_of(sample: dict[str, Any]) -> Float[Tensor, "3 h w"]:
-    """RGB in [0, 1] of a sample's picture. Raises ValueError without one, or for a damaged one."""
+def picture_of(sample: dict[str, Any]) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
+    """A sample's picture, RGB in [0, 1], and 1 where it is opaque by half or more. Raises ValueError without one, or for a damaged one."""
     suffix = next((suffix for suffix in _PICTURES if suffix in sample), None)
     if suffix is None:
         raise ValueError(f"expected a picture ({', '.join(_PICTURES)}), got {sorted(key for key in sample if key[0] != '_')}")
     import cv2
 
-    pixels = cv2.imdecode(np.frombuffer(sample[suffix], dtype=np.uint8), cv2.IMREAD_COLOR)
+    _require_decodable(suffix, sample[suffix])
+    data = np.frombuffer(sample[suffix], dtype=np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if pixels is None:
         raise ValueError(f"its {suffix} is damaged")
-    return rearrange(torch.from_numpy(pixels[:, :, ::-1].copy()), "h w c -> c h w").float() / 255
+    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if suffix in _MAY_BE_TRANSPARENT else pixels
+    opaque = np.ones(pixels.shape[:2], dtype=np.float32)
+    if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
+        stored = stored.astype(np.float32) / (257 if stored.dtype == np.uint16 else 1)
+        opaque = (stored[:, :, 3] >= 127.5).astype(np.float32)
+        pixels = stored[:, :, :3]  # both from the same reading: OpenCV turns opaque pictures alone as their EXIF tags say
+    image = rearrange(torch.from_numpy(np.ascontiguousarray(pixels[:, :, ::-1])), "h w c -> c h w").float() / 255
+    return image, torch.from_numpy(opaque)[None]
+
+
+def _require_decodable(suffix: str, data: bytes) -> None:
+    """Raises ValueError for a picture that is too large, by its header. What is no picture at all is left to the decoder."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+    except Image.DecompressionBombError as error:  # Pillow's own bound is lower than ours
+        raise ValueError(f"its {suffix} has too many pixels ({error}); make it smaller") from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return
+    require_decodable(f"its {suffix}", height, width, 4)
 
 
 def caption_of(sample: dict[str, Any]) -> str:
@@ -139,7 +171,7 @@ def caption_of(sample: dict[str, Any]) -> str:
     if "json" not in sample:
         return ""
     try:
-        entry = json.loads(sample["json"])
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        entry = parse_json(sample["json"])
+    except ValueError as error:
         raise ValueError(f"its json is damaged ({error})") from error
     return str(entry.get("caption") or entry.get("text") or "") if isinstance(entry, dict) else ""

@@ -24,6 +24,7 @@ from fb_core.data.transforms_json import JSON_NAME
 from fb_core.data.undistort import straight_camera
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import raymaps_of
+from fb_core.masks import wholly_known
 
 _logger = logging.getLogger(__name__)
 _CAPTURES_IN_MEMORY = 64  # parsed JSON files
@@ -208,8 +209,6 @@ class Window:
     def read(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
         """(picture, truth); the picture is black where there is no truth."""
         image, mask, _ = self.frame.load_undistorted()
-        # Where there is no truth there is no colour either: what stands there must not be mixed into its neighbours.
-        image = media.resize(torch.where(mask > 0, image, torch.zeros_like(image)), self.height, self.width)
-        mask = (media.resize(mask, self.height, self.width) > 1 - 1e-3).to(mask)
+        image, mask = wholly_known(image, mask, lambda channels: media.resize(channels, self.height, self.width))
         cut = (slice(None), slice(self.top, self.top + self.size), slice(self.left, self.left + self.size))
-        return (image * mask)[cut], mask[cut]
+        return image.clamp(0, 1)[cut], mask[cut]

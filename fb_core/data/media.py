@@ -18,6 +18,8 @@ from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.limits import require_decodable
+
 HEIF_SUFFIXES = (".heic", ".heif")
 _MARKER_IN_JPEG_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # stuffed zeros, fill bytes and restarts are no markers
 
@@ -69,15 +71,20 @@ def has_alpha(path: str | Path) -> bool:
 
 
 def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int, int]:
-    """(height, width) in pixels, upright, from the file's header and its end (a file cut short is refused); nothing is decoded."""
+    """(height, width) in pixels, upright, from the file's header and its end; nothing is decoded.
+
+    A file cut short is refused, and one that could not be decoded here because it is too large.
+    """
     path = _checked_file(path)
     if path.suffix.lower() in HEIF_SUFFIXES:
         width, height = opened_heif(path).size
+        require_decodable(f"image {path}", height, width, 3)
         return height, width
     reader = _opened(path)
     spec = reader.spec()
     height, width, orientation = spec.height, spec.width, _orientation(path, spec)
     reader.close()
+    require_decodable(f"image {path}", height, width, spec.nchannels)
     return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
 
 
@@ -241,6 +248,7 @@ def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
 
     reader = _opened(path)
     spec = reader.spec()
+    require_decodable(f"image {path}", spec.height, spec.width, spec.nchannels)
     kind = oiio.UINT8 if spec.format == oiio.TypeUInt8 else oiio.FLOAT
     array = reader.read_image(0, 0, 0, spec.nchannels, kind)
     error = reader.geterror()
@@ -265,6 +273,7 @@ def _orientation(path: Path, spec) -> int:
 def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     """Like :func:`_decode` for HEIC photos; their decoder turns them upright itself."""
     image = opened_heif(path)
+    require_decodable(f"image {path}", image.size[1], image.size[0], 3)
     try:
         array = np.array(image)
     except (OSError, RuntimeError, SyntaxError, ValueError) as error:

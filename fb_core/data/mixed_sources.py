@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data.training_task import Draw, Sequences, Source, TaskConfig
+from fb_core.sampling.randomness import generator_of
 
 
 class AnyOf:
@@ -122,9 +123,9 @@ class SeveralPerRow:
 
 
 class Later:
-    """One source up to a step, another from then on, with sequences of another length."""
+    """One source up to a step, another from then on, with sequences of another length (None = as the task or the source says)."""
 
-    def __init__(self, first: Source, then: Source, *, from_step: int, views: int):
+    def __init__(self, first: Source, then: Source, *, from_step: int, views: int | None = None):
         self.first, self.then, self.from_step, self._views = first, then, from_step, views
         self._is_later = False
 
@@ -151,8 +152,48 @@ class Later:
         return self._now.raymaps(rows, task, draw)
 
     def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
-        """Of the step's source, with as many views as its resolution has."""
-        return self._now.sequences(rows, dataclasses.replace(task, views=self._views) if self._is_later else task, draw)
+        """Of the step's source, with as many views as its sequences have."""
+        own = task if self._views is None or not self._is_later else dataclasses.replace(task, views=self._views)
+        return self._now.sequences(rows, own, draw)
+
+
+def turn(count: int, *, seed: int, step: int) -> tuple[int, int]:
+    """Which of ``count`` things a step's turn is, and how often it was that one's turn before.
+
+    Every ``count`` steps each has one turn, in an order of its own: equal odds, known for any step without looking at others.
+    """
+    before, place = divmod(step, count)
+    return int(torch.randperm(count, generator=generator_of(seed, before))[place]), before
+
+
+class InTurn:
+    """One of several sources at each step (see :func:`turn`), each with sequences of its own length."""
+
+    def __init__(self, sources: Sequence[Source], *, views: Sequence[int], seed: int):
+        self.sources, self._lengths, self.seed = tuple(sources), tuple(views), seed
+        self._which = 0
+
+    @property
+    def views(self) -> int:
+        """What every one of them has."""
+        return min(source.views for source in self.sources)
+
+    def advance(self, step: int, rows: range | None = None) -> None:
+        """Choose the step's source and take it to the step, counted by its own turns."""
+        self._which, before = turn(len(self.sources), seed=self.seed, step=step)
+        self.sources[self._which].advance(before, rows)
+
+    def images(self, rows: range, draw: Draw) -> Float[Tensor, "b 3 h w"]:
+        """Of the step's source."""
+        return self.sources[self._which].images(rows, draw)
+
+    def raymaps(self, rows: range, task: TaskConfig, draw: Draw) -> Float[Tensor, "b 6 h w"]:
+        """Of the step's source."""
+        return self.sources[self._which].raymaps(rows, task, draw)
+
+    def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
+        """Of the step's source, with as many views as its sequences have."""
+        return self.sources[self._which].sequences(rows, dataclasses.replace(task, views=self._lengths[self._which]), draw)
 
 
 _ALL_OR_NONE = ("image_latents", "distance")

@@ -21,6 +21,7 @@ from fb_core.data.captures import Frame, read_capture
 from fb_core.data.exif import read_exif
 from fb_core.data.transforms_json import JSON_NAME
 from fb_core.geometry.cameras import Pinholes
+from fb_core.masks import resampled
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".exr", ".bmp", *media.HEIF_SUFFIXES)
 THUMBNAIL_SIDE = 96
@@ -265,6 +266,5 @@ def _shrunk(pixels: Pixels, longest_side: int | None) -> tuple[Float[Tensor, "3 
     if bool((mask == 1).all()):
         image = media.shrink(image, longest_side)
         return image, torch.ones_like(image[:1])
-    small = media.shrink(mask, longest_side)
-    colours = media.shrink(torch.where(mask > 0, image * mask, 0.0), longest_side)
-    return torch.where(small > 0, colours / small.clamp(min=1e-6), 0.0).clamp(0, 1), small
+    image, share = resampled(image, mask, lambda channels: media.shrink(channels, longest_side))
+    return image.clamp(0, 1), share

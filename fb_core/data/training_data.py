@@ -12,7 +12,7 @@ import torch
 from fb_core.data.captioned_images import CaptionedConfig, CaptionedImages
 from fb_core.data.capture_sequences import CaptureConfig, CaptureSource, find_captures
 from fb_core.data.meshes import MeshConfig, MeshPool, find_meshes
-from fb_core.data.mixed_sources import Alternating, AnyOf, Later, SeveralPerRow
+from fb_core.data.mixed_sources import Alternating, AnyOf, InTurn, Later, SeveralPerRow, turn
 from fb_core.data.sequences import Encode, PoolConfig, RoomPool
 from fb_core.data.training_task import Source
 from fb_core.sampling.randomness import mixed
@@ -43,7 +43,7 @@ class TrainingData:
 
 @dataclass(frozen=True, kw_only=True)
 class Resolution:
-    """What a process does at one image size (paper, appendix "Hyperparameters")."""
+    """What a step does at one image size (paper, appendix "Hyperparameters")."""
 
     image_size: int
     """Side of the views in pixels."""
@@ -53,11 +53,6 @@ class Resolution:
     """Sequences in a row of the batch."""
     images: int = 1
     """Captioned pictures in a row of the batch."""
-
-
-def resolution_of(resolutions: tuple[Resolution, ...], *, seed: int, rank: int) -> Resolution:
-    """The resolution that a process is assigned, each with the same probability (paper)."""
-    return resolutions[mixed(seed, _SOURCES, rank) % len(resolutions)]
 
 
 def multi_view_source(
@@ -104,9 +99,18 @@ def training_source(
     return Alternating(source, CaptionedImages(data.images, config, seed=seed, device=device), single_share=single_share)
 
 
-def at_resolution(
+def resolution_of(resolutions: tuple[Resolution, ...], *, seed: int, step: int) -> Resolution:
+    """The resolution of a step, counted from where they begin; each has the same odds (paper).
+
+    The paper assigns one to each process. Then what is learned depends on how many processes there are, and the largest
+    pictures are waited for by all; so here all processes do a step at one size.
+    """
+    return resolutions[turn(len(resolutions), seed=mixed(seed, _SOURCES), step=step)[0]]
+
+
+def at_resolutions(
     first: Source,
-    resolution: Resolution,
+    resolutions: tuple[Resolution, ...],
     from_step: int,
     data: TrainingData,
     pool: PoolConfig,
@@ -116,8 +120,30 @@ def at_resolution(
     device: torch.device | str = "cpu",
     encode: Encode | None = None,
 ) -> Source:
-    """``first`` until a step, from then on the same data at another resolution."""
-    smaller = max(8, round(pool.rooms * (pool.image_size / resolution.image_size) ** 2))  # as many pixels
+    """``first`` until a step, from then on the same data at the resolution of each step (:func:`resolution_of`)."""
+    shared = {"single_share": single_share, "seed": seed, "device": device, "encode": encode}
+    sources = [
+        _at_resolution(one, data, pool, among=len(resolutions), number=number, **shared)  # type: ignore[arg-type]
+        for number, one in enumerate(resolutions)
+    ]
+    then = InTurn(sources, views=[one.views for one in resolutions], seed=mixed(seed, _SOURCES))
+    return Later(first, then, from_step=from_step)
+
+
+def _at_resolution(
+    resolution: Resolution,
+    data: TrainingData,
+    pool: PoolConfig,
+    *,
+    among: int,
+    number: int,
+    single_share: float,
+    seed: int,
+    device: torch.device | str,
+    encode: Encode | None,
+) -> Source:
+    """The data at one of ``among`` resolutions; pools of all together hold as many pixels as the one that they follow."""
+    smaller = max(8, round(pool.rooms * (pool.image_size / resolution.image_size) ** 2 / among))
     size, rooms = resolution.image_size, min(pool.rooms, smaller)
     pool = dataclasses.replace(pool, image_size=size, rooms=rooms, views=max(pool.views, resolution.views))
     then = multi_view_source(data, pool, seed=seed, device=device, encode=encode)
@@ -125,7 +151,7 @@ def at_resolution(
         then = SeveralPerRow(then, resolution.sequences)
     if single_share and data.images is not None:
         single = CaptionedImages(
-            data.images, CaptionedConfig(image_size=size, per_row=resolution.images), seed=mixed(seed, _SOURCES), device=device
+            data.images, CaptionedConfig(image_size=size, per_row=resolution.images), seed=mixed(seed, _SOURCES, number), device=device
         )
         then = Alternating(then, single, single_share=single_share)
-    return Later(first, then, from_step=from_step, views=resolution.views)
+    return then

@@ -16,21 +16,23 @@ from torch import Tensor
 
 from fb_core.data import media
 from fb_core.geometry.cameras import Pinholes
+from fb_core.json_files import read_json
+from fb_core.limits import is_finite
 
 JSON_NAME = "transforms.json"
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *DISTORTION_KEYS, "camera_model")
+_BLANK = 64  # bytes of a file that may be nothing but white space
 _ROTATION_TOLERANCE = 1e-3  # an error of that size moves a pixel by one at a focal of 1000
 
 
 def load_transforms(path: Path) -> dict[str, Any]:
     """The JSON object in a file."""
-    text = path.read_bytes()
-    if not text.strip():
+    if path.stat().st_size <= _BLANK and not path.read_bytes().strip():
         raise ValueError(f"capture {path}: the file is empty; process the pictures again")
     try:
-        meta = json.loads(text)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        meta = read_json(path)
+    except ValueError as error:
         raise ValueError(f"capture {path}: not a JSON file ({error}); process the pictures again") from error
     if not isinstance(meta, dict):
         raise ValueError(f"capture {path}: expected a JSON object with 'frames', got a {type(meta).__name__}; process the pictures again")
@@ -101,7 +103,7 @@ def _focal(where: str, values: dict[str, Any], name: str, angle_name: str, lengt
 def finite_number(where: str, values: dict[str, Any], key: str) -> float:
     """``values[key]`` as a float."""
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if not is_finite(value):
         raise ValueError(f"{where}: expected a finite number for {key}, got {value!r}; correct the file")
     return float(value)
 
@@ -110,7 +112,7 @@ def checked_pose(where: str, matrix: Any) -> Float[Tensor, "3 4"]:
     """The OpenGL camera-to-world matrix as it stands in the file, once it is known to be a rigid motion."""
     try:
         pose = torch.tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         pose = torch.empty(0)
     if tuple(pose.shape) not in ((4, 4), (3, 4)):
         raise ValueError(f"{where}: expected transform_matrix as 4 x 4 (or 3 x 4) numbers, got {str(matrix)[:60]}; correct the file")

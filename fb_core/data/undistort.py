@@ -11,9 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.masks import wholly_known
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+_TOUCHES_NOTHING = 1 - 1e-4  # OpenCV knows 32 places within a pixel: a neighbour weighs at least 1 / 1024
 
 
 def check_lens(camera_model: str, distortion: dict[str, float], where: str) -> None:
@@ -49,11 +51,13 @@ def undistort(
 
     straight = straight_camera(camera, camera_model, distortion)
     to_bent = (_fisheye_map if camera_model in FISHEYE_MODELS else _perspective_map)(camera, distortion, _matrix(straight))
-    colours = torch.where(mask > 0, image, torch.zeros_like(image))  # unknown colours may be anything, NaN included
-    bent = rearrange(torch.cat([colours, mask]), "c h w -> h w c").contiguous().numpy()
-    result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
-    result = rearrange(torch.from_numpy(result), "h w c -> c h w")
-    return result[:3].contiguous(), (result[3:] > 1 - 1e-4).to(mask.dtype), straight
+
+    def remapped(channels: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+        bent = rearrange(channels, "c h w -> h w c").contiguous().numpy()
+        result = cv2.remap(bent, *to_bent, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0))
+        return rearrange(torch.from_numpy(result), "h w c -> c h w")
+
+    return *wholly_known(image, mask, remapped, least=_TOUCHES_NOTHING), straight
 
 
 def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, float]) -> Pinholes:

@@ -20,6 +20,9 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.film_colours import to_rgb
+from fb_core.limits import MOST_FILM_PIXELS, require_decodable
+
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp", ".wmv", ".ogv", ".flv")
 _SHARPNESS_SIDE = 480  # pixels of the longer side in which sharpness is measured: motion blur must still be seen
 _MOTION_SIDE = 120  # and motion
@@ -27,7 +30,7 @@ _LEAST_SIDE = 32  # optical flow needs as much
 _NEW_REFERENCE = 0.04  # once the picture has moved by this share of its longer side, motion is measured from here on
 _MOST_STEP = 0.25  # of the longer side: what optical flow says beyond that (a cut) is not believed
 _LEAST_COMPLETE = 0.95  # share of the frames announced by the header that must be there
-_UNTAGGED = 2  # colour space "unspecified"
+_HELD_CHANNELS = 6  # three of colours and as many of frames that a decoder keeps to predict others from
 _HDR = (16, 18)  # transfer curves PQ and HLG
 _CACHE_BYTES = 256 * 2**20
 _logger = logging.getLogger(__name__)
@@ -179,7 +182,7 @@ def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray,
     sharpness: list[float] = []
     way: list[float] = []
     display, start, group, odometer = None, 0.0, 0, _Odometer()
-    announced, pixel_aspect = _header(path)
+    announced, pixel_aspect = _header(path)  # refuses what is too large before anything is decoded
     for frame in _frames(path, faults):
         if frame.pts is None or frame.time is None or (frames and frame.pts <= frames[-1].pts):
             faults.append("some frames have no time; ffmpeg -i FILM film.mp4 writes it anew")
@@ -294,11 +297,16 @@ def _opened(path: Path) -> Any:
 
 
 def _header(path: Path) -> tuple[float, float]:
-    """How many seconds the film lasts (0 = not told), and how wide a stored pixel is for its height."""
+    """How many seconds the film lasts (0 = not told), and how wide a stored pixel is for its height.
+
+    Raises ValueError for frames that are too large to be decoded here.
+    """
     with _opened(path) as container:
         stream = container.streams.video[0]
         seconds = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
-        return seconds, float(stream.sample_aspect_ratio or 1)
+        pixel_aspect = float(stream.sample_aspect_ratio or 1)
+        require_decodable(f"film {path}", stream.height, stream.width * pixel_aspect, _HELD_CHANNELS, most=MOST_FILM_PIXELS)
+        return seconds, pixel_aspect
 
 
 def _small_grey(frame: Any) -> np.ndarray:
@@ -311,14 +319,7 @@ def _small_grey(frame: Any) -> np.ndarray:
 def _pixels(frame: Any, display: Display) -> np.ndarray:
     """RGB as shown: uint8 [h, w, 3]."""
     height, width = display.size[::-1] if display.transposed else display.size
-    array = frame.reformat(width=width, height=height, format="rgb24", src_colorspace=_colour_matrix(frame)).to_ndarray()
+    array = to_rgb(frame, height, width)
     array = array.swapaxes(0, 1) if display.transposed else array
     right, down = display.matrix.sum(axis=0)  # of each column one number counts for turns by quarters
     return np.ascontiguousarray(array[:: 1 if down >= 0 else -1, :: 1 if right >= 0 else -1])
-
-
-def _colour_matrix(frame: Any) -> str | None:
-    """How the frame's colours are coded: None = as its tags say; without tags BT.709 for HD films and BT.601 for small ones."""
-    if int(frame.colorspace) != _UNTAGGED:
-        return None
-    return "ITU709" if min(frame.height, frame.width) >= 720 else "ITU601"

@@ -16,6 +16,8 @@ from typing import Any, Literal
 
 import torch
 
+from fb_core.machine import usable_cores
+
 OnCell = Callable[[str], None]
 """Told what is measured next."""
 
@@ -96,7 +98,7 @@ def hardware() -> str:
         models = [line.split(":", 1)[1].strip() for line in table.read_text().splitlines() if line.startswith("model name")]
         name = models[0] if models else name
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
-    return f"{name}, {os.cpu_count()} cores, {torch.get_num_threads()} threads{gpu}, torch {torch.__version__}"
+    return f"{name}, {usable_cores()} cores, {torch.get_num_threads()} threads{gpu}, torch {torch.__version__}"
 
 
 def commit() -> str:

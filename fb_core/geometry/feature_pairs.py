@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fb_core.geometry.triangulation import detect, mutual_matches
+from fb_core.masks import resampled
 
 _COARSE_SIDE, _COARSE_LIMIT = 320, 400  # small copies of photos that tell which of them are worth matching
 _FEATURES = 2500
 _ALL_PAIRS = 16  # photos of which every pair is matched
 _PARTNERS = 12  # of each photo when there are more
 _RATIO = 0.8  # Lowe 2004
+_BEFORE_BOTH = 0.8  # of the matches on epipolar lines; with fewer before both cameras, the motion is doubtful
 FEWEST_MATCHES = 16
 """Pairs with fewer verified matches say nothing."""
 _SIDE_PER_PIXEL = 700  # of a photo's longer side: a match may miss by one pixel of a photo of this size, and by no less than one pixel
@@ -58,11 +60,13 @@ def features_of(
     places, descriptors, _ = detect(image, known, limit=_FEATURES)
     shrink = min(1.0, _COARSE_SIDE / max(size))
     small = [max(1, round(side * shrink)) for side in size]
+    everything = torch.ones_like(image[:1])
 
-    def shrunk(pixels: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
-        return torch.nn.functional.interpolate(pixels[None], size=small, mode="bilinear", antialias=True)[0]
+    def shrunk(channels: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
+        return torch.nn.functional.interpolate(channels[None], size=small, mode="bilinear", antialias=True)[0]
 
-    coarse = detect(shrunk(image), None if known is None else (shrunk(known) > 0.5).float(), limit=_COARSE_LIMIT)[1]
+    small_image, share = resampled(image, everything if known is None else known, shrunk)
+    coarse = detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
     return PhotoFeatures(places=places, descriptors=descriptors, coarse=coarse, size=size, focal=focal, lens=lens)
 
 
@@ -103,8 +107,6 @@ def candidate_pairs(photos: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
 
 def match_pairs(photos: Sequence[PhotoFeatures], on_pair: Callable[[int, int], None]) -> dict[tuple[int, int], Int[np.ndarray, "m 2"]]:
     """Mutual matches of all candidate pairs that a fundamental matrix or a homography explains; no focal length is needed for that."""
-    import cv2
-
     found: dict[tuple[int, int], np.ndarray] = {}
     pairs = candidate_pairs(photos)
     for number, (i, j) in enumerate(pairs):
@@ -117,8 +119,7 @@ def match_pairs(photos: Sequence[PhotoFeatures], on_pair: Callable[[int, int], N
             continue
         first, second = photos[i].offsets[matches[:, 0]], photos[j].offsets[matches[:, 1]]
         tolerance = max(photos[i].tolerance, photos[j].tolerance)
-        _, kept = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, 0.9999, 5000)
-        kept = np.zeros(len(matches), bool) if kept is None else kept[:, 0] > 0
+        kept = _on_epipolar_lines(first, second, tolerance)
         if kept.sum() >= FEWEST_MATCHES:
             found[i, j] = matches[kept]
     return found
@@ -128,17 +129,11 @@ def verified_pair(
     photos: Sequence[PhotoFeatures], key: tuple[int, int], matches: Int[np.ndarray, "m 2"], focal: Sequence[float]
 ) -> Pair | None:
     """The motion between two photos of known focal lengths, with the matches that agree with it; None if too few do."""
-    import cv2
-
     i, j = key
     first = photos[i].offsets[matches[:, 0]] / focal[i]
     second = photos[j].offsets[matches[:, 1]] / focal[j]
     tolerance = max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j])
-    essential, kept = cv2.findEssentialMat(first, second, np.eye(3), cv2.USAC_MAGSAC, 0.9999, tolerance)
-    if essential is None or essential.shape != (3, 3) or kept.sum() < FEWEST_MATCHES:
-        return None
-    _, rotation, translation, kept = cv2.recoverPose(essential, first, second, np.eye(3), mask=kept.copy())
-    inliers = kept[:, 0] > 0
+    rotation, translation, inliers = _motion(first, second, tolerance)
     if inliers.sum() < FEWEST_MATCHES:
         return None
     angle = angles_degrees(rays_of(first[inliers]) @ rotation.T, rays_of(second[inliers]))
@@ -150,6 +145,55 @@ def verified_pair(
         translation=translation[:, 0],
         parallax_degrees=float(np.median(angle)),
     )
+
+
+def _on_epipolar_lines(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], tolerance: float) -> Bool[np.ndarray, " m"]:
+    """Matches that one fundamental matrix explains."""
+    import cv2
+
+    for method in (cv2.USAC_MAGSAC, cv2.RANSAC):
+        try:
+            _, kept = cv2.findFundamentalMat(first, second, method, tolerance, 0.9999, 5000)
+        except cv2.error:  # the first method fails an assertion of OpenCV's own on some matches of good photos
+            continue
+        return np.zeros(len(first), bool) if kept is None else kept[:, 0] > 0
+    return np.zeros(len(first), bool)
+
+
+def _motion(
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], tolerance: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 1"], Bool[np.ndarray, " m"]]:
+    """Rotation, direction of translation, and the matches that they put on their epipolar lines and before both cameras.
+
+    On a wall, a matrix with a wrong motion lies within the tolerance of all matches too, but puts half of them behind a
+    camera. Where that happens, the one of least median error, which has no tolerance to be satisfied with, is tried as well.
+    """
+    import cv2
+
+    best = np.eye(3), np.zeros((3, 1)), np.zeros(len(first), bool)
+    for method in (cv2.USAC_MAGSAC, cv2.LMEDS):
+        try:
+            essential, kept = cv2.findEssentialMat(first, second, np.eye(3), method, 0.9999, tolerance)
+        except cv2.error:
+            continue
+        if essential is None or essential.shape != (3, 3) or kept.sum() < FEWEST_MATCHES:
+            continue
+        near = _misses(essential, first, second) <= tolerance
+        _, rotation, translation, kept = cv2.recoverPose(essential, first, second, np.eye(3), mask=near[:, None].astype(np.uint8))
+        if (kept[:, 0] > 0).sum() > best[2].sum():
+            best = rotation, translation, kept[:, 0] > 0
+        if best[2].sum() >= _BEFORE_BOTH * near.sum():
+            break
+    return best
+
+
+def _misses(
+    essential: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, " m"]:
+    """First order distances of matches from their epipolar lines (Sampson 1982), in the unit of the places."""
+    a, b = (np.concatenate([places, np.ones((len(places), 1))], axis=1) for places in (first, second))
+    lines, back = a @ essential.T, b @ essential
+    return np.abs((b * lines).sum(axis=1)) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1) + 1e-30)
 
 
 def rays_of(places: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from fb_core.limits import require_model_sizes
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
-from fb_core.networks.weights import adopt, without_weights
+from fb_core.networks.weights import adopt, require_plain, without_weights
 
 TRANSFORMER_FILE = "transformer.ckpt"
 IMAGE_VAE_FILE = "image-vae.ckpt"
@@ -60,13 +61,21 @@ def read_state(path: Path, key: str) -> dict[str, Tensor]:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise ValueError(f"{path}: refused, because it holds Python objects other than tensors, which could run code.") from error
-    except (RuntimeError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: truncated, or not a PyTorch checkpoint ({str(error).splitlines()[0]}).") from error
+    except Exception as error:  # a damaged pickle raises whatever it leads to
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{path}: truncated, or not a PyTorch checkpoint ({reason:.200}).") from error
     state = content.get(key) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"{path}: expected a dictionary with the weights under {key!r}, got {found}.")
-    return {WRAPPERS.sub("", name): value for name, value in state.items()}
+    foreign = next((name for name in state if not isinstance(name, str)), None)
+    if foreign is not None:
+        raise ValueError(f"{path}: expected names of weights, got the key {foreign!r:.40}; these are weights of another architecture.")
+    tensors = {WRAPPERS.sub("", name): value for name, value in state.items()}
+    if len(tensors) < len(state):
+        raise ValueError(f"{path}: two of its weights have the same name but for wrappers' prefixes (module., model.); save them once.")
+    require_plain(str(path), tensors)
+    return tensors
 
 
 def _transformer(path: Path) -> DiT:
@@ -118,6 +127,7 @@ def _autoencoder_config(path: Path, state: dict[str, Tensor], padding: str) -> V
 
 def _checked(path: Path, kind: type, **sizes: Any) -> Any:
     try:
+        require_model_sizes(sizes)
         return kind(**sizes)
     except ValueError as error:
         raise ValueError(f"{path}: these are weights of another architecture ({error})") from error

@@ -57,7 +57,7 @@ class VAEConfig:
             raise ValueError(f"padding: expected 'zeros' or 'replicate', got {self.padding!r}.")
         if self.norm == "group" and any(width % self.norm_groups for width in self.widths):
             raise ValueError(f"norm_groups: expected a divisor of every width in {self.widths}, got {self.norm_groups}.")
-        if not self.scaling > 0:
+        if not 0 < self.scaling < float("inf"):
             raise ValueError(f"scaling: expected a positive number, got {self.scaling}.")
 
 

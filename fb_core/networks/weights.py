@@ -36,7 +36,25 @@ def without_weights(build: Callable[[], Network]) -> Network:
         return build().eval()
 
 
+def require_plain(where: str, tensors: Mapping[str, Tensor]) -> None:
+    """Raise a ValueError that begins with `where` and names the first tensor that holds no weights as they are used here.
+
+    Weights are dense tensors of real floating-point numbers, each with memory of its own.
+    """
+    for name, value in tensors.items():
+        if value.layout != torch.strided or value.is_quantized:
+            kind = "quantized" if value.is_quantized else str(value.layout).removeprefix("torch.")
+            raise ValueError(f"{where}: expected {name} to be a dense tensor, got a {kind} one; save the weights as plain tensors.")
+        if not value.is_floating_point():
+            raise ValueError(f"{where}: expected {name} to hold floating-point numbers, got {str(value.dtype).removeprefix('torch.')}.")
+        if value.device.type == "meta":
+            raise ValueError(f"{where}: {name} has a shape but no numbers; save the weights after they have been loaded.")
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise ValueError(f"{where}: {name} repeats the same numbers over {list(value.shape)}; save the weights as plain tensors.")
+
+
 def adopt(where: str, module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Make `tensors` (not copies of them) the module's parameters. Raises ValueError as `require_shapes` does."""
+    """Make `tensors` (not copies of them) the module's parameters. Raises ValueError as `require_plain` and `require_shapes` do."""
+    require_plain(where, tensors)
     require_shapes(where, module, {name: tuple(value.shape) for name, value in tensors.items()})
     module.load_state_dict(dict(tensors), strict=True, assign=True)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from fb_core.limits import MOST_SAMPLING_STEPS, is_finite, require_between
 from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.sampling.solvers import SOLVERS
 from fb_core.sampling.time_grids import time_grid
@@ -75,6 +76,10 @@ class SamplingConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
+        require_between("rounds", self.rounds, 1, MOST_SAMPLING_STEPS)
+        for name in ("guidance_unknown", "guidance_known", "guidance_text"):
+            if not is_finite(getattr(self, name)):
+                raise ValueError(f"{name}: expected a finite number, got {getattr(self, name)!r}")
 
     @property
     def times(self) -> list[float]:
@@ -94,6 +99,9 @@ class SamplingConfig:
         unknown = set(options) - {option.name for option in dataclasses.fields(SamplingConfig)}
         if unknown:
             raise ValueError(f"sampling options: {', '.join(sorted(unknown))} unknown to this version; update fillerbuster or remove them")
-        if "guidance" in options:
-            options["guidance"] = GuidanceVariant(**options["guidance"])
-        return SamplingConfig(**options)
+        try:
+            if "guidance" in options:
+                options["guidance"] = GuidanceVariant(**options["guidance"])
+            return SamplingConfig(**options)
+        except TypeError as error:  # a text instead of a number
+            raise ValueError(f"sampling options: {error}; remove them from the model's config.json") from error

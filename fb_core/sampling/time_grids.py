@@ -5,6 +5,10 @@ The best grid depends on the flow (docs/speed_and_accuracy.md), so it is an opti
 
 from __future__ import annotations
 
+import math
+
+from fb_core.limits import MOST_SAMPLING_STEPS, require_between
+
 GRIDS = ("even", "reference")
 REFERENCE_LAST = 0.001
 """The original's smallest time before 0."""
@@ -22,9 +26,8 @@ def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: floa
 
     Raises ValueError for no steps, a shift that is not positive, an unknown grid and a start outside (0, 1].
     """
-    if steps < 1:
-        raise ValueError(f"sampling steps: expected at least 1, got {steps}")
-    if not shift > 0:
+    require_between("sampling steps", steps, 1, MOST_SAMPLING_STEPS)
+    if not 0 < shift < math.inf:
         raise ValueError(f"time shift: expected a positive number, got {shift}")
     if grid not in GRIDS:
         raise ValueError(f"time grid: expected one of {', '.join(GRIDS)}, got {grid!r}")

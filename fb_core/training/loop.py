@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from fb_core.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.networks.blocks import Block
 from fb_core.networks.dit import DiT
 from fb_core.networks.precision import PRECISIONS, Precision, in_words, resolved
@@ -95,6 +96,7 @@ class LoopConfig:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.save_every < 1:
             raise ValueError(f"training: steps and save_every must be at least 1, got {self.steps} and {self.save_every}")
+        require_between("training: steps", self.steps, 1, MOST_TRAINING_STEPS)
         if not 0 <= self.cooldown <= 1 or not 0 <= self.average < 1:
             raise ValueError(f"training: cooldown must lie in [0, 1] and average in [0, 1), got {self.cooldown} and {self.average}")
         if self.optimizer not in OPTIMIZERS:

@@ -16,7 +16,7 @@ from torch import nn
 from fb_core import checkpoint
 from fb_core.conditioning import encode_in_chunks
 from fb_core.data.sequences import PoolConfig
-from fb_core.data.training_data import Resolution, TrainingData, at_resolution, multi_view_source, resolution_of, training_source
+from fb_core.data.training_data import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
 from fb_core.data.training_task import Source
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.text import WORDS, TextEncoder
@@ -69,7 +69,7 @@ class Recipe:
     single_view_share: float = 0.0
     """Share of the steps that show captioned single pictures (paper: 0.5), where such data are named."""
     resolutions: tuple[Resolution, ...] = ()
-    """Image sizes of the transformer's last steps, one of which each process is assigned; none = one size throughout."""
+    """Image sizes of the transformer's last steps, each of which has one of them; none = one size throughout."""
     resolutions_from: int = 0
     """Step at which they begin."""
     data: TrainingData = TrainingData()
@@ -100,7 +100,7 @@ def run_stage(
 
     Raises ValueError for an unknown stage, and for a transformer whose autoencoders are not there yet.
     """
-    task, loop = make_stage(recipe, stage, folder, device=device, rank=group.rank)
+    task, loop = make_stage(recipe, stage, folder, device=device)
     loop = loop if steps is None else dataclasses.replace(loop, steps=steps)
     engine = engine or recipe.engine
     on_sheet = make_sheet(recipe, task) if engine.sheet_every else None
@@ -116,12 +116,9 @@ def run_stage(
 
 
 def make_stage(
-    recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu", rank: int = 0
+    recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu"
 ) -> tuple[VAEStage | DiTStage, LoopConfig]:
-    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born.
-
-    ``rank`` is this process's number, which decides its resolution where the recipe has several.
-    """
+    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born."""
     if stage not in STAGES:
         raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")
     if stage != "dit":
@@ -130,7 +127,7 @@ def make_stage(
         _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device) for kind in STAGES[:2]
     )
     encode_text = _encode_text(recipe, device, stands_in=folder is None) if recipe.dit.text_width else None
-    return dit_stage(recipe, image_vae, raymap_vae, device=device, rank=rank, encode_text=encode_text), recipe.dit_loop
+    return dit_stage(recipe, image_vae, raymap_vae, device=device, encode_text=encode_text), recipe.dit_loop
 
 
 def dit_stage(
@@ -139,7 +136,6 @@ def dit_stage(
     raymap_vae: VAE,
     *,
     device: torch.device | str = "cpu",
-    rank: int = 0,
     encode_text: EncodeText | None = None,
     source: Source | None = None,
     shared: SharedBatches | None = None,
@@ -150,7 +146,7 @@ def dit_stage(
         _begun(network, recipe, "transformer").to(device),
         image_vae=image_vae,
         raymap_vae=raymap_vae,
-        pool=sequences_of(recipe, image_vae, device, rank) if source is None else source,
+        pool=sequences_of(recipe, image_vae, device) if source is None else source,
         config=recipe.dit_loss,
         seed=recipe.seed,
         encode_text=encode_text,
@@ -158,8 +154,8 @@ def dit_stage(
     )
 
 
-def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "cpu", rank: int = 0) -> Source:
-    """The transformer's data: at one size, and at this process's own from some step on."""
+def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "cpu") -> Source:
+    """The transformer's data: at one size, and from some step on at one of several in each step."""
     shared: dict[str, Any] = {
         "seed": recipe.seed + 1,
         "device": device,
@@ -169,9 +165,9 @@ def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "c
     source = training_source(recipe.data, recipe.pool, per_row=recipe.dit_loss.images_per_row, **shared)
     if not recipe.resolutions:
         return source
-    mine = resolution_of(recipe.resolutions, seed=recipe.seed, rank=rank)
-    _logger.info("process %d: %d x %d pixels from step %d on", rank, mine.image_size, mine.image_size, recipe.resolutions_from)
-    return at_resolution(source, mine, recipe.resolutions_from, recipe.data, recipe.pool, **shared)
+    sizes = ", ".join(str(one.image_size) for one in recipe.resolutions)
+    _logger.info("views of %s pixels in turn from step %d on", sizes, recipe.resolutions_from)
+    return at_resolutions(source, recipe.resolutions, recipe.resolutions_from, recipe.data, recipe.pool, **shared)
 
 
 def _encode_text(recipe: Recipe, device: torch.device | str, *, stands_in: bool) -> EncodeText:
