@@ -46,7 +46,7 @@ def test_what_lies_infinitely_far_is_carried_over_exactly(crop):
     guess = carried_over(wall(rays[::2]), everywhere(rays[::2]), rays[::2], rays[1::2])
     assert float(guess.there.mean()) > 0.9
     error = (guess.images - wall(rays[1::2])).abs() * guess.there
-    assert float(error.max()) < 0.01
+    assert float(error.max()) < 0.02  # of interpolation
 
 
 def test_a_view_is_carried_into_itself():

@@ -68,7 +68,7 @@ def carried_over(
         same_surface: relative difference of distances up to which two views show the same surface.
     """
     count, (height, width) = len(wanted), wanted.shape[-2:]
-    if not len(images):
+    if not len(images) or not count:
         return Carried(wanted.new_zeros(count, 3, height, width), wanted.new_zeros(count, 1, height, width))
     lens = _lens_of(raymaps)
     directions = rearrange(wanted[:, 3:], "m c h w -> 1 m h w c")
