@@ -118,7 +118,13 @@ def train(
 
 
 def convert(
-    checkpoints: Annotated[Path, tyro.conf.Positional], /, *, output: Path, text_encoder: Path | None = None, half: bool = False
+    checkpoints: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    text_encoder: Path | None = None,
+    half: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Turn the authors' released checkpoints into a model folder.
 
@@ -127,12 +133,14 @@ def convert(
         output: New folder for the model.
         text_encoder: Folder with the CLIP text model; stores the embedding of the empty prompt, so that CLIP is needed no more.
         half: Store in half precision (the raymap autoencoder never is).
+        overwrite: Replace an earlier model there.
     """
     import torch
 
     from fb_core import checkpoint
 
-    folder = checkpoint.convert(checkpoints, output, dtype=torch.float16 if half else None, text_encoder=text_encoder)
+    dtype = torch.float16 if half else None
+    folder = checkpoint.convert(checkpoints, output, dtype=dtype, text_encoder=text_encoder, overwrite=overwrite)
     logging.getLogger(__name__).info("wrote the model to %s", folder)
 
 

@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.files.whole import by_way_of_memory
+
 _QUALITY = "18"  # constant rate factor: no visible loss
 _LEAST_SIDE = 480  # smaller pictures are enlarged in whole numbers, since players blur what they enlarge themselves
 
@@ -31,7 +33,7 @@ def write_film(path: Path, frames: Iterable[Float[Tensor, "3 h w"]], *, frames_p
 
     size: tuple[int, ...] = ()
     count = 0
-    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+    with by_way_of_memory(path) as place, av.open(place, "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream: Any = None
         for picture in frames:
             pixels = _even_pixels(picture)
