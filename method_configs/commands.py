@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fb_core.files.faults import sentence_of
 from method_configs.ablation_evaluation import Ablations
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
@@ -340,7 +341,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         _stop(error, "Stopped.", _ENDED_BY_USER)
     except (ValueError, FloatingPointError, OSError) as error:
-        _stop(error, f"Error: {error}", 1)
+        _stop(error, f"Error: {sentence_of(error)}", 1)
 
 
 def _stop(error: BaseException, sentence: str, code: int) -> None:

@@ -55,6 +55,13 @@ def is_of_the_disk(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _OF_THE_DISK
 
 
+def sentence_of(error: BaseException) -> str:
+    """An error's own text, or what to do where it says that a disk is full or cannot be written."""
+    if isinstance(error, OSError) and not isinstance(error, CannotWrite) and is_of_the_disk(error) and error.filename is not None:
+        return str(CannotWrite(Path(os.fsdecode(error.filename)), error))
+    return str(error)
+
+
 def _of_writing(error: BaseException | None, unfinished: Path) -> OSError | None:
     """The error among this one and its causes that the system raised for writing."""
     while error is not None:
