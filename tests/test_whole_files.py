@@ -177,6 +177,28 @@ def test_a_reader_waits_for_a_live_swap(tmp_path: Path):
         later.join()
 
 
+def test_a_folder_is_never_absent_while_it_is_replaced_again_and_again(tmp_path: Path):
+    """On Linux; nor does a reader that opened a file of it ever find half of one."""
+    if sys.platform != "linux":
+        pytest.skip("other systems have no single step, but settled() for readers")
+    folder, stop, absent, looks = tmp_path / "out", threading.Event(), [], []
+    write(folder, "0")
+
+    def look() -> None:
+        while not stop.is_set():
+            looks.append(1)
+            if not (folder / "below" / "two").exists():
+                absent.append(1)
+
+    reader = threading.Thread(target=look)
+    reader.start()
+    for number in range(50):
+        write(folder, str(number))
+    stop.set()
+    reader.join()
+    assert len(looks) > 50 and absent == []
+
+
 def test_files_of_somebody_else_in_a_replaced_folder_are_kept(tmp_path: Path, way: str, caplog):
     folder = tmp_path / "out"
     write(folder, "old")
