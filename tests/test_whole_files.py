@@ -210,6 +210,39 @@ def test_files_of_somebody_else_in_a_replaced_folder_are_kept(tmp_path: Path, wa
     assert (tmp_path / "out.replaced-1" / "below" / "mine.txt").read_text() == "mine" and "such as below/mine.txt" in caplog.text
 
 
+@pytest.mark.parametrize("stands", ["nothing", "an empty folder", "another folder"])
+def test_an_interrupted_swap_never_costs_the_old_folder(tmp_path: Path, stands: str):
+    """A kill between the two renames, after which somebody makes the folder anew: the old one is the last of its kind."""
+    folder, work = tmp_path / "out", tmp_path / ".out.unfinished-0badcafe"
+    write(folder, "old")
+    write(tmp_path / "new", "new")
+    work.mkdir()
+    (work / "owner").touch()
+    os.rename(folder, work / "old")
+    os.rename(tmp_path / "new", work / "new")
+    if stands == "an empty folder":
+        folder.mkdir()
+    elif stands == "another folder":
+        write(tmp_path / "third", "third")
+        os.rename(tmp_path / "third", folder)
+    with unfinished_beside(folder):
+        pass
+    assert content(folder) == ("third" if stands == "another folder" else "old")
+    assert names(tmp_path) == (["out", "out.replaced-1"] if stands == "another folder" else ["out"])
+    assert stands != "another folder" or content(tmp_path / "out.replaced-1") == "old"
+
+
+def test_files_of_somebody_else_survive_a_kill_after_the_swap(tmp_path: Path):
+    write(tmp_path / "out", "new")
+    work = tmp_path / ".out.unfinished-0badcafe"
+    write(work / "new", "old")
+    (work / "owner").touch()
+    (work / "new" / "mine.txt").write_text("mine")
+    write(tmp_path / "out", "newer")
+    assert content(tmp_path / "out") == "newer" and names(tmp_path) == ["out", "out.replaced-1"]
+    assert (tmp_path / "out.replaced-1" / "mine.txt").read_text() == "mine"
+
+
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path):
     path = tmp_path / "new folder" / "report.json"
     for text in ("old", "new"):

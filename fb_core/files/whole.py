@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import logging
 import os
 import secrets
@@ -24,6 +23,11 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # no system with such locks; what killed processes leave then stays
+    fcntl = None
 
 from fb_core.files.faults import CannotWrite, telling
 from fb_core.files.ownership import Target, foreign_files, write_mark
@@ -134,8 +138,10 @@ def remove_folder(target: Target) -> None:
 def discard(folder: Path, *, foreign: list[str]) -> None:
     """Take away a folder in one step; if it holds files of somebody else, it stays beside its place with a warning."""
     with unfinished_beside(folder) as work, _told(folder):
-        os.rename(folder, work / _GONE)
-        _keep_foreign(work / _GONE, folder, foreign)
+        if foreign:
+            _keep(folder, folder, f"held files that are not ours, such as {foreign[0]}")
+        else:
+            os.rename(folder, work / _GONE)
 
 
 def settled(path: Path) -> Path:
@@ -157,21 +163,17 @@ def settled(path: Path) -> Path:
 
 
 def _put_in_place(work: Path, folder: Path) -> None:
+    """What stood there before is left in the hidden folder, whose end decides about it."""
     new, old = work / _NEW, work / _OLD
     if not folder.exists() or not any(folder.iterdir()):
         os.rename(new, folder)  # which replaces an empty folder in one step
-        return
-    if _exchange(new, folder):
-        previous = new
-    else:
+    elif not _exchange(new, folder):
         os.rename(folder, old)
         try:
             os.rename(new, folder)
         except OSError:
             os.rename(old, folder)
             raise
-        previous = old
-    _keep_foreign(previous, folder, foreign_files(previous))
 
 
 def _exchange(one: Path, other: Path) -> bool:
@@ -188,15 +190,13 @@ def _exchange(one: Path, other: Path) -> bool:
     raise OSError(number, os.strerror(number), str(other))
 
 
-def _keep_foreign(previous: Path, folder: Path, foreign: list[str]) -> None:
-    """A replaced folder into which somebody has put files of their own stays beside the new one."""
-    if not foreign:
-        return
+def _keep(previous: Path, folder: Path, why: str) -> None:
+    """Put what stood at a place beside it, by a name of its own."""
     number = 1
     while os.path.lexists(kept := folder.with_name(f"{folder.name}.replaced-{number}")):
         number += 1
     os.rename(previous, kept)
-    _logger.warning("%s held files that are not ours, such as %s; what was replaced is kept as %s", folder, foreign[0], kept)
+    _logger.warning("%s %s; what was replaced is kept as %s", folder, why, kept)
 
 
 # ---- the hidden folders ---------------------------------------------------------------------------------------------
@@ -234,6 +234,8 @@ def _claimed(path: Path) -> tuple[Path, int]:
 
 def _locked(descriptor: int) -> bool | None:
     """Whether the lock could be had; None on a disk that has no locks."""
+    if fcntl is None:
+        return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -267,12 +269,22 @@ def _clean_up(work: Path, path: Path) -> None:
 
 
 def _mend(work: Path, path: Path) -> None:
-    """Remove a hidden folder; what stood at the place goes back there if nothing does. If that fails, all stays for the next try."""
+    """Remove a hidden folder, but nothing in it that is the last of its kind. If that fails, all stays for the next try.
+
+    Where ``old`` and ``new`` are both there, their swap has not come to its end: the old one goes back, or beside what stands there by
+    now. Files that somebody else has put into what was replaced are kept with it.
+    """
     try:
-        if (work / _OLD).exists():
-            os.rename(work / _OLD, work / _GONE if os.path.lexists(path) else path)
+        if (work / _OLD).exists() and (work / _NEW).exists():
+            if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir())):
+                _keep(work / _OLD, path, "was written anew after its replacement had been interrupted")
+            else:
+                os.rename(work / _OLD, path)
+        for name in (_NEW, _OLD, _GONE):
+            if foreign := foreign_files(work / name):
+                _keep(work / name, path, f"held files that are not ours, such as {foreign[0]}")
     except OSError as error:
-        _logger.warning("%s is kept in %s: it could not be put back (%s)", path, work / _OLD, error)
+        _logger.warning("%s is kept in %s, for it could not be put back (%s)", path, work, error)
         return
     with suppress(OSError):
         for entry in sorted(work.iterdir()):
