@@ -206,6 +206,7 @@ def test_commands_on_such_a_disk(disk: Disk, shared_path, tmp_path: Path, tiny_c
     for name, arguments in {
         "export": ("export", run, "--format", "nerfstudio", "--overwrite"),
         "model": ("convert", shared_path("golden/reference")),
+        "scene": ("complete", tiny_capture, "--poses-only", "--cameras", "features"),
         "room": ("rooms", "--views", 3, "--size", 64, "--held-out", 2),
         "training": ("train", "rooms-tiny", "--device", "cpu", "--steps", 1),
     }.items():
