@@ -141,7 +141,7 @@ def test_other_files_that_frames_name_are_never_copied(run: Path, tiny_capture: 
     assert "depth_file_path" not in (run / "export-nerfstudio" / "transforms.json").read_text()
 
 
-@pytest.mark.parametrize("role", ["../../../outside", "/tmp/outside", "a/b", "", "a" * 300, "a\nb"])
+@pytest.mark.parametrize("role", ["../../../outside", "/outside", "a/b", "", "a" * 300, "a\nb"])
 def test_names_in_a_run_lead_nowhere(tiny_capture: Path, tmp_path: Path, capsys, role: str):
     """Generated pictures are named after what a checkpoint says of them."""
     run = make_run(tmp_path / "run", tiny_capture, generated_views())
