@@ -21,7 +21,8 @@ from torch import Tensor
 from fb_core.data import media
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.undistort import straight_directions
-from fb_core.data.whole_folder import whole_folder
+from fb_core.files.ownership import Target
+from fb_core.files.whole import whole_folder
 
 CENTER, RADIUS = (1.95, -1.10, 0.65), 1.3
 """Of the sphere around the head, in the units and axes of transforms.json. Nose (2.48, -1.25, -0.24) and ear tips (1.79, -1.83, 1.59),
@@ -55,7 +56,7 @@ def main() -> None:
     capture = read_capture(told.capture)
     content = json.loads((told.capture / "transforms.json").read_text(encoding="utf-8"))
     center, shares = torch.tensor(CENTER, dtype=torch.float64), []
-    with whole_folder(told.output) as unfinished:
+    with whole_folder(Target(folder=told.output, kind="capture", overwrite=True, inputs=(told.capture,))) as unfinished:
         (unfinished / "images").mkdir()
         (unfinished / "masks").mkdir()
         for entry, frame in zip(content["frames"], capture.frames, strict=True):

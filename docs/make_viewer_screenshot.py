@@ -23,8 +23,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import tyro
-import yaml
 from playwright.sync_api import Page, sync_playwright
+
+from fb_nerfstudio.run_config import read_run_config
 
 BROWSERS = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
 # WebGL in software, so that it also works where there is no graphics card.
@@ -104,7 +105,7 @@ def _looking(config: Path) -> list[Path | str]:
 
 def _training(config: Path, output: Path) -> list[Path | str]:
     """The command that goes on with a run, into another folder."""
-    told = yaml.load(config.read_text(), Loader=yaml.Loader)
+    told = read_run_config(config)
     checkpoints = config.parent / "nerfstudio_models"
     command = [Path(sys.executable).with_name("ns-train"), told.method_name, "--data", told.data, "--load-dir", checkpoints]
     return [*command, "--output-dir", output, "--vis", "viewer", "--max-num-iterations", "1000000"]

@@ -8,8 +8,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import shutil
-import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from fb_core.files.ownership import MARK_NAME, Target
+from fb_core.files.whole import settled, whole_folder
 from fb_core.json_files import read_json
 from fb_core.limits import MOST_SIDE, is_finite, require_between, require_model_sizes
 from fb_core.networks.dit import DiT, DiTConfig
@@ -87,8 +87,13 @@ class Loaded:
     """Text embedding of the empty prompt, where the folder has one."""
 
 
+def model_target(folder: str | os.PathLike[str], *, overwrite: bool, inputs: tuple[Path, ...] = ()) -> Target:
+    """A model folder that is to be written; earlier ones are known by their mark, or by holding a model and nothing else."""
+    return Target(folder=Path(folder), kind="model", overwrite=overwrite, inputs=inputs, earlier=_is_model)
+
+
 def save(
-    folder: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | Target,
     *,
     dit: DiT,
     image_vae: VAE,
@@ -100,52 +105,51 @@ def save(
     """Write a model folder, replacing an earlier model there only once the new one is complete; returns the folder.
 
     `dtype` converts the transformer and the image autoencoder (None keeps theirs); the raymap autoencoder is stored in float32.
-    `info` must be JSON. Raises ValueError if the folder holds anything that is not a model.
+    `info` must be JSON. Raises ValueError if the folder holds anything that is not a model, and CannotWrite when the disk is full.
     """
-    folder = Path(folder).resolve()
-    if folder.exists():
-        _refuse_foreign(folder)
+    target = folder if isinstance(folder, Target) else model_target(folder, overwrite=True)
+    require_model_or_free(target)
     config = ModelConfig(transformer=dit.config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
     try:
         content = {"format_version": FORMAT_VERSION, **_told(config), "info": info or {}}
         text = json.dumps(content, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected values that JSON can hold (no NaN, no tensors), but {error}.") from error
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.mkdir()
-    try:
+    with whole_folder(target) as unfinished:
         modules: dict[str, nn.Module] = {"transformer": dit, "image_vae": image_vae, "raymap_vae": raymap_vae}
         for section, file in WEIGHT_FILES.items():
             stored = torch.float32 if section == "raymap_vae" else dtype
             state = modules[section].state_dict()
-            save_file({name: value.to(device="cpu", dtype=stored).contiguous() for name, value in state.items()}, partial / file)
+            save_file({name: value.to(device="cpu", dtype=stored).contiguous() for name, value in state.items()}, unfinished / file)
         if empty_prompt is not None:
-            save_file({PROMPT_KEY: empty_prompt.detach().float().cpu().contiguous()}, partial / PROMPT_FILE)
-        (partial / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
-        _swap(partial, folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return folder
+            save_file({PROMPT_KEY: empty_prompt.detach().float().cpu().contiguous()}, unfinished / PROMPT_FILE)
+        (unfinished / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
+    return target.folder.resolve()
+
+
+def require_model_or_free(target: Target) -> None:
+    """Raises ValueError for a folder that a model must not replace: also for a model among other files."""
+    folder = settled(target.folder)
+    if folder.exists() and not folder.is_symlink():
+        _refuse_foreign(folder)
+    target.check()
 
 
 def _refuse_foreign(folder: Path) -> None:
     if not folder.is_dir():
         raise ValueError(f"folder: expected a model folder or a new one, but {folder} is a file.")
-    foreign = sorted({entry.name for entry in folder.iterdir()} - {CONFIG_FILE, PROMPT_FILE, *WEIGHT_FILES.values()})
+    foreign = sorted({entry.name for entry in folder.iterdir()} - {CONFIG_FILE, PROMPT_FILE, MARK_NAME, *WEIGHT_FILES.values()})
     if foreign:
         raise ValueError(f"folder: {folder} holds {foreign[0]!r}, which is not part of a model; choose an empty or new folder.")
 
 
-def _swap(partial: Path, folder: Path) -> None:
-    """Put the finished `partial` in the place of `folder`."""
-    if not folder.exists():
-        partial.rename(folder)
-        return
-    previous = partial.with_suffix(".previous")
-    folder.rename(previous)
-    partial.rename(folder)
-    shutil.rmtree(previous)
+def _is_model(folder: Path) -> bool:
+    """Whether a folder without a mark has a configuration of ours; other programs write files called config.json, too."""
+    try:
+        told = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(told, dict) and {"format_version", "transformer", "image_vae", "raymap_vae"} <= set(told)
 
 
 def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> Loaded:
@@ -174,7 +178,7 @@ def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", 
 
 def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, Any]]:
     """Architecture and info of a model folder, without touching its weights. Raises ValueError as `load` does."""
-    path = Path(folder) / CONFIG_FILE
+    path = settled(Path(folder)) / CONFIG_FILE
     if not path.parent.is_dir():
         raise ValueError(f"folder: expected a model folder, but there is no folder {path.parent}.")
     if not path.is_file():
@@ -289,17 +293,21 @@ def convert(
     *,
     dtype: torch.dtype | None = None,
     text_encoder: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Turn the folder of released `.ckpt` files into a model folder; returns it.
 
     `text_encoder` is a folder with the CLIP text model; with it, the embedding of the empty prompt is stored too, and multi-view use
-    needs CLIP no more. Raises ValueError as `networks.released.read_released` and `save` do.
+    needs CLIP no more. `overwrite` replaces an earlier model. Raises ValueError as `networks.released.read_released` and `save` do.
     """
+    inputs = tuple(Path(given) for given in (checkpoints, text_encoder) if given is not None)
+    target = model_target(output, overwrite=overwrite, inputs=inputs)
+    require_model_or_free(target)  # before gigabytes are read
     released = read_released(checkpoints)
     prompt = None
     if text_encoder is not None:
         prompt = TextEncoder.from_folder(text_encoder).encode([""])[0]
     info = {"source": "converted from the authors' released checkpoints", "license": RELEASED_LICENSE}
     return save(
-        output, dit=released.dit, image_vae=released.image_vae, raymap_vae=released.raymap_vae, info=info, empty_prompt=prompt, dtype=dtype
+        target, dit=released.dit, image_vae=released.image_vae, raymap_vae=released.raymap_vae, info=info, empty_prompt=prompt, dtype=dtype
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from fb_core.data.captures import Capture, FrameToWrite, write_capture
+from fb_core.files.ownership import Target
 from fb_core.geometry.cameras import Pinholes
 
 ANCHOR, DENSIFY, REQUESTED, INPAINTED, BROUGHT = "anchor", "densify", "requested", "inpainted", "brought"
@@ -23,6 +25,11 @@ def round_title(role: str, number: int) -> str:
     """What a person reads for a round."""
     titles = {ANCHOR: "Anchors", INPAINTED: "Inpainted", REQUESTED: f"Requested {number}", BROUGHT: "From the capture"}
     return titles.get(role, f"Round {number}")
+
+
+def views_target(folder: Path, *, inputs: tuple[Path, ...] = ()) -> Target:
+    """Where a run keeps its generated views as a capture; earlier ones there are replaced."""
+    return Target(folder=folder, kind="generated views", overwrite=True, inputs=inputs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +49,10 @@ class Origin:
     """Content hash of the diffusion weights."""
     aspect: float = 1.0
     """Width over height of the part of the square view that may be trained on; the rest is margin."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", self.role) or not isinstance(self.round, int):  # files are named after them
+            raise ValueError(f"Origin: expected a role of letters and the number of a round, got {self.role[:40]!r} and {self.round!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,12 +139,13 @@ class CompletedViews:
         origins = tuple(Origin(**origin) for origin in state["origins"])
         return CompletedViews(images=state["images"], masks=state["masks"], cameras=cameras, origins=origins)
 
-    def save_capture(self, folder: Path) -> Capture:
+    def save_capture(self, folder: Path | Target) -> Capture:
         """Write the views as a capture folder (transforms.json, images, masks where they are not whole), replacing an earlier one.
 
         Poses are in the world of the splats, so ``orientation_override`` keeps nerfstudio's reader from turning them. Each
-        frame says that it was generated, and how. The folder appears whole or not at all.
+        frame says that it was generated, and how. The folder appears whole or not at all. Raises ValueError for a folder of others.
         """
+        target = folder if isinstance(folder, Target) else views_target(folder)
         images = self.images.cpu().permute(0, 3, 1, 2).float() / 255
         masks = self.masks.cpu().permute(0, 3, 1, 2).float()
         cameras = self.cameras.to("cpu", torch.float64)
@@ -148,4 +160,4 @@ class CompletedViews:
             )
             for index, origin in enumerate(self.origins)
         ]
-        return write_capture(folder, frames, extra={"orientation_override": "none"}, overwrite=True)
+        return write_capture(target, frames, extra={"orientation_override": "none"})

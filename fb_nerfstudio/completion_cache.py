@@ -7,13 +7,10 @@ weights. The key names one file below the cache folder, which appears whole or n
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import logging
-import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from fb_core.files.whole import whole_file
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 
@@ -95,15 +93,11 @@ class CompletionCache:
     def keep(self, key: str, images: UInt8[Tensor, "n h w 3"]) -> None:
         """Store a round's pictures, whole or not at all."""
         path, images = self.path(key), images.cpu().contiguous()
-        unfinished = path.with_name(f".{key[:16]}.{secrets.token_hex(4)}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_file({_IMAGES: images}, unfinished, metadata={"key": key, "sha256": _digest(images)})
-            os.replace(unfinished, path)
+            with whole_file(path) as unfinished:
+                save_file({_IMAGES: images}, unfinished, metadata={"key": key, "sha256": _digest(images)})
         except (SafetensorError, OSError) as error:
             _logger.warning("completion.cache_dir: could not keep a round in %s (%s); the run goes on without", self.folder, error)
-            with contextlib.suppress(OSError):
-                unfinished.unlink()
 
 
 def _canonical_bytes(sequence: Views) -> Iterator[bytes]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import shutil
 import time
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -18,12 +17,13 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.data.captures import Frame
+from fb_core.files.whole import remove_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.bank import Bank, without_requested
 from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
 from fb_nerfstudio.captured_views import CapturedViewsDatamanager
-from fb_nerfstudio.completed_views import CompletedViews, round_title
+from fb_nerfstudio.completed_views import CompletedViews, round_title, views_target
 from fb_nerfstudio.completion import Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
@@ -361,15 +361,21 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self.completion_panel.show(views)
 
     def _save_bank(self, trainer: Any) -> Path | None:
-        """Write the bank as a capture into the run's folder and return where; None without a trainer."""
+        """Write the bank as a capture into the run's folder and return where; None without a trainer, and where something else stands."""
         if trainer is None:
             return None
-        folder = Path(trainer.base_dir) / COMPLETION_FOLDER
+        data = self.config.data or self.config.dataparser.data
+        target = views_target(Path(trainer.base_dir) / COMPLETION_FOLDER, inputs=() if data is None else (Path(data),))
+        try:
+            target.check()
+        except ValueError as error:
+            _logger.warning("%s; the generated views are in the checkpoint alone", error)
+            return None
         if self.generated_views is not None:
-            self.generated_views.save_capture(folder)
-        elif folder.exists():
-            shutil.rmtree(folder)
-        return folder
+            self.generated_views.save_capture(target)
+        else:
+            remove_folder(target)
+        return target.folder
 
     def get_extra_state(self) -> dict[str, Any]:
         """The bank and the place in the sequence of draws; lands in the checkpoint as ``datamanager._extra_state``."""

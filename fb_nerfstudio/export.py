@@ -16,10 +16,13 @@ from typing import Any, Literal
 from fb_core.data import media
 from fb_core.data.captures import Capture, Frame, split_lists, splits_of, write_transforms
 from fb_core.data.colmap_model import ColmapImage, write_colmap
+from fb_core.data.own_files import own_pictures, own_points
 from fb_core.data.points import Points, read_points, write_points
-from fb_core.data.whole_folder import whole_folder
+from fb_core.files.ownership import Target, as_target
+from fb_core.files.whole import whole_folder
 from fb_nerfstudio.saved_run import CompletedCapture
 
+KIND = "export"
 PROVENANCE_NAME = "frames.json"
 """Beside a COLMAP model, which has no room for it: what is known of every picture, by its name."""
 _COLMAP_FOLDER = Path("sparse/0")
@@ -29,27 +32,24 @@ _MODEL = "PINHOLE"
 
 def write_export(
     completed: CompletedCapture,
-    folder: Path,
+    folder: Path | Target,
     *,
     format: Literal["nerfstudio", "colmap"],
     points: Points | None,
     held_out: bool = True,
-    overwrite: bool = False,
 ) -> int:
     """Write captured and generated views as a dataset, whole or not at all; returns how many pictures it has.
 
     Args:
         completed: what a run has left.
-        folder: of the dataset; new or empty, or with ``overwrite`` an earlier export.
+        folder: of the dataset; new or empty, or as a target an earlier export that may be replaced.
         format: ``nerfstudio`` (transforms.json) or ``colmap`` (sparse/0 as text and binary).
-        points: coloured points in the capture's world; None takes the capture's own cloud.
+        points: coloured points in the capture's world; None takes the capture's own cloud, if it has one that may be copied.
         held_out: also write the captured pictures that the run did not train on; lists of names tell them apart.
-        overwrite: replace an earlier export.
 
     Raises ValueError for a folder that holds something else, and OSError or ValueError when the disk is full.
     """
-    _check_folder(folder, overwrite)
-    with whole_folder(folder) as unfinished:
+    with whole_folder(as_target(folder, KIND)) as unfinished:
         (unfinished / "images").mkdir()
         captured = _captured_frames(completed, unfinished, held_out)
         generated = _generated_frames(completed, unfinished, masked=any(frame.mask_path for frame in captured))
@@ -58,22 +58,14 @@ def write_export(
     return len(frames)
 
 
-def _check_folder(folder: Path, overwrite: bool) -> None:
-    """An export never sweeps away anything but an export or a capture."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not overwrite:
-        raise ValueError(f"{folder} exists already; choose another --output, or replace it with --overwrite")
-    if not any((folder / name).is_file() for name in ("transforms.json", PROVENANCE_NAME)):
-        raise ValueError(f"{folder} holds something else than an export, which --overwrite does not touch; choose another --output")
-
-
 def _captured_frames(completed: CompletedCapture, folder: Path, held_out: bool) -> list[Frame]:
     """The capture's pictures and masks in the folder. Masks are for all or for none, as nerfstudio wants."""
     frames = completed.capture.frames
     masked = any(frame.mask_path is not None or media.has_alpha(frame.image_path) for frame in frames)
     masked = masked or not bool(completed.generated.masks.all())
-    chosen = [index for index in range(len(frames)) if held_out or index not in completed.held_out]
+    chosen = [index for index in own_pictures(completed.capture) if held_out or index not in completed.held_out]
+    if not chosen:
+        raise ValueError(f"capture {completed.capture.root}: none of its pictures lies in its folder, so that none may be copied")
     names = _file_names([frames[index] for index in chosen])
     return [
         _captured_frame(frames[index], folder / "images" / name, masked=masked, held_out=index in completed.held_out)
@@ -87,6 +79,7 @@ def _captured_frame(frame: Frame, target: Path, *, masked: bool, held_out: bool)
         image, mask, camera = frame.load_undistorted()
         media.write_image(target, image)
     else:
+        _require_picture(frame)
         shutil.copyfile(frame.image_path, target)
         mask = frame.load_mask() if masked else None
     mask_path = None
@@ -96,6 +89,12 @@ def _captured_frame(frame: Frame, target: Path, *, masked: bool, held_out: bool)
     kept = {key: value for key, value in frame.extra.items() if not key.endswith("_path") and key not in _LENS_EXTRAS}
     extra = {**kept, "generated": False, "held_out": held_out}
     return Frame(image_path=target, mask_path=mask_path, camera=camera, camera_model=_MODEL, extra=extra)
+
+
+def _require_picture(frame: Frame) -> None:
+    """Raises ValueError for a file that is not the picture that its camera took; only pictures are copied."""
+    if media.image_size(frame.image_path, apply_orientation=False) != (frame.camera.height, frame.camera.width):
+        frame.load_image()  # which says what is wrong, or that it lies on its side and fits
 
 
 def _generated_frames(completed: CompletedCapture, folder: Path, *, masked: bool) -> list[Frame]:
@@ -131,11 +130,12 @@ def _file_names(frames: Sequence[Frame]) -> list[str]:
 
 def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], points: Points | None) -> None:
     """transforms.json with lists of the splits, and points3D.ply."""
-    points_path = None if points is None and capture.points_path is None else folder / "points3D.ply"
+    own = own_points(capture) if points is None else None
+    points_path = None if points is None and own is None else folder / "points3D.ply"
     if points is not None:
         write_points(folder / "points3D.ply", points)
-    elif points_path is not None and capture.points_path is not None:
-        shutil.copyfile(capture.points_path, points_path)
+    elif points_path is not None and own is not None:
+        shutil.copyfile(own, points_path)
     extra: dict[str, Any] = {key: value for key, value in capture.extra.items() if key not in _LENS_EXTRAS and key != "camera_model"}
     extra |= split_lists(frames, folder)
     write_transforms(Capture(root=folder, frames=tuple(frames), points_path=points_path, extra=extra), folder)
@@ -144,8 +144,10 @@ def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], point
 def _write_colmap(folder: Path, capture: Capture, frames: list[Frame], points: Points | None) -> None:
     """sparse/0, lists of the splits as nerfstudio's COLMAP reader takes them, and the provenance of every picture."""
     if points is None:
-        assert capture.points_path is not None  # the caller gives points where the capture has none
-        points = read_points(capture.points_path)
+        own = own_points(capture)
+        if own is None:
+            raise ValueError(f"capture {capture.root}: a COLMAP model needs points, and it has none that may be copied; give points")
+        points = read_points(own)
     images = [ColmapImage(name=frame.image_path.name, camera=frame.camera) for frame in frames]
     write_colmap(folder / _COLMAP_FOLDER, images, points)
     for split, chosen in splits_of(frames).items():

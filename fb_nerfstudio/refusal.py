@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from fb_core import checkpoint
 from fb_core.data.camera_path import read_camera_path
 from fb_core.data.captures import Capture, Frame, validate_capture
+from fb_core.files.faults import CannotWrite, is_of_the_disk
 from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.grid_inpainter import check_weights
@@ -22,6 +26,20 @@ class Refused(SystemExit, ValueError):
     It is a ValueError for programs. Uncaught it ends a command as SystemExit does: the sentence alone on stderr, exit code 1,
     and no traceback, which nerfstudio's commands would print for any other error.
     """
+
+
+@contextmanager
+def refusing_what_cannot_be_written(folder: Path) -> Iterator[None]:
+    """Raises Refused with one sentence where something below a run's folder cannot be written, whoever writes it."""
+    try:
+        yield
+    except OSError as error:
+        if not isinstance(error, CannotWrite):
+            named = Path(error.filename) if isinstance(error.filename, str | os.PathLike) else None
+            if not is_of_the_disk(error) and (named is None or not named.absolute().is_relative_to(folder.absolute())):
+                raise
+            error = CannotWrite(named or folder, error)
+        raise Refused(f"{error}; checkpoints that are there are whole, and --load-dir goes on from them") from None
 
 
 def refuse_bad_capture(config: Any) -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
+from fb_core.files.faults import telling
+from fb_core.files.whole import unfinished_beside, whole_file
+from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
 
 
 @dataclass
@@ -44,6 +48,13 @@ class FillerbusterTrainerConfig(TrainerConfig):
         elif self.load_checkpoint is not None and not self.load_checkpoint.is_file():
             raise Refused(f"load_checkpoint {self.load_checkpoint}: no such file; check the path")
 
+    def save_config(self) -> None:
+        """As nerfstudio, whole or not at all. Raises Refused with one sentence when it cannot be written."""
+        folder = self.get_base_dir()
+        CONSOLE.log(f"Saving config to: {folder / 'config.yml'}")
+        with refusing_what_cannot_be_written(folder), whole_file(folder / "config.yml") as unfinished:
+            unfinished.write_text(yaml.dump(self), "utf8")
+
 
 class FillerbusterTrainer(Trainer):
     """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on, on a CPU to the same bits."""
@@ -57,9 +68,28 @@ class FillerbusterTrainer(Trainer):
         wanted = datamanager.start_points
         try:
             datamanager.start_points = 0 if goes_on else wanted
-            super().setup(test_mode)
+            with refusing_what_cannot_be_written(self.base_dir):
+                super().setup(test_mode)
         finally:
             datamanager.start_points = wanted
+
+    def train(self) -> None:
+        """As nerfstudio. A full disk ends the run with one sentence, whichever of its files could not be written."""
+        with refusing_what_cannot_be_written(self.base_dir):
+            super().train()
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio, once it is known that the file holds plain values: older versions of torch run code that is in it."""
+        given, folder, step = self.config.load_checkpoint, self.config.load_dir, self.config.load_step
+        if folder is not None:
+            given = max(folder.glob("step-*.ckpt")) if step is None else folder / f"step-{step:09d}.ckpt"
+        if given is not None:
+            try:
+                torch.load(given, map_location="cpu", weights_only=True, mmap=True)
+            except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+                told = " ".join(str(error).split())[:200]
+                raise Refused(f"checkpoint {given}: not readable as plain values ({told}); give one that ns-train has saved") from None
+        super()._load_checkpoint()
 
     def train_iteration(self, step: int) -> Any:
         """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed run repeats them."""
@@ -70,14 +100,15 @@ class FillerbusterTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio, but written beside the earlier checkpoints and then renamed; only then are the earlier ones removed."""
         folder = Path(self.checkpoint_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as unfinished:
-            self.checkpoint_dir = Path(unfinished)
+        with refusing_what_cannot_be_written(self.base_dir), unfinished_beside(folder) as work:
+            self.checkpoint_dir = work / "new"
             try:
-                super().save_checkpoint(step)
+                with telling(folder / f"step-{step:09d}.ckpt", work / "new"):
+                    super().save_checkpoint(step)
             finally:
                 self.checkpoint_dir = folder
-            for path in Path(unfinished).glob("*.ckpt"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in sorted((work / "new").glob("*.ckpt")):
                 os.replace(path, folder / path.name)
                 for old in folder.glob("*.ckpt") if self.config.save_only_latest_checkpoint else ():
                     if old.name != path.name:

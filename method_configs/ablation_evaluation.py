@@ -10,6 +10,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.whole import whole_file
+
 if TYPE_CHECKING:
     from fb_core.evaluation.ablations import AblationTask, Asked, Distance
     from fb_core.inpainter import Fillerbuster
@@ -112,7 +114,8 @@ def _measured(
     for folder, model in _trained(missing, autoencoders).items():
         count = partial(_count, f"{folder.name}: sequence")
         rows = evaluate_design(model, asked(), missing[folder].sampling, times=task.times, distance=distance, on_sequence=count)
-        (folder / "measured.json").write_text(json_format.dumps({"asked": decides[folder], "rows": rows}, indent=1) + "\n")
+        with whole_file(folder / "measured.json") as unfinished:
+            unfinished.write_text(json_format.dumps({"asked": decides[folder], "rows": rows}, indent=1) + "\n")
         measured[folder] = rows
     return measured
 

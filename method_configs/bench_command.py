@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.whole import whole_file
+
 if TYPE_CHECKING:
     from fb_core.evaluation.benchmarks import Report
 
@@ -168,7 +170,7 @@ def _axes(label: str) -> tuple[Any, Any]:
 def _save(figure: Any, path: Path) -> None:
     from matplotlib import pyplot
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=150)
     pyplot.close(figure)
     _logger.info("wrote %s", path)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.whole import whole_file
+
 if TYPE_CHECKING:
     from fb_core.evaluation.benchmarks import Report
 
@@ -79,8 +81,8 @@ def draw(report: Report, path: Path) -> None:
     for axes in panels[-1]:
         axes.set_xlabel("passes of the network")
     panels[0][0].legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=130)
     pyplot.close(figure)
     _logger.info("wrote %s", path)
 

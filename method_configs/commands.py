@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fb_core.files.faults import sentence_of
 from method_configs.ablation_evaluation import Ablations
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
@@ -120,7 +121,13 @@ def train(
 
 
 def convert(
-    checkpoints: Annotated[Path, tyro.conf.Positional], /, *, output: Path, text_encoder: Path | None = None, half: bool = False
+    checkpoints: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    text_encoder: Path | None = None,
+    half: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Turn the authors' released checkpoints into a model folder.
 
@@ -129,12 +136,14 @@ def convert(
         output: New folder for the model.
         text_encoder: Folder with the CLIP text model; stores the embedding of the empty prompt, so that CLIP is needed no more.
         half: Store in half precision (the raymap autoencoder never is).
+        overwrite: Replace an earlier model there.
     """
     import torch
 
     from fb_core import checkpoint
 
-    folder = checkpoint.convert(checkpoints, output, dtype=torch.float16 if half else None, text_encoder=text_encoder)
+    dtype = torch.float16 if half else None
+    folder = checkpoint.convert(checkpoints, output, dtype=dtype, text_encoder=text_encoder, overwrite=overwrite)
     logging.getLogger(__name__).info("wrote the model to %s", folder)
 
 
@@ -334,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         _stop(error, "Stopped.", _ENDED_BY_USER)
     except (ValueError, FloatingPointError, OSError) as error:
-        _stop(error, f"Error: {error}", 1)
+        _stop(error, f"Error: {sentence_of(error)}", 1)
 
 
 def _stop(error: BaseException, sentence: str, code: int) -> None:

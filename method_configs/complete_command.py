@@ -17,10 +17,12 @@ from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextC
 
 from fb_core.data.camera_path import read_camera_path
 from fb_core.data.captures import read_capture
+from fb_core.data.own_files import own_points
 from fb_core.data.photo_choice import doubtful, require_two_views
 from fb_core.data.photos import Photo, read_photos
-from fb_core.data.whole_folder import whole_folder
 from fb_core.evaluation.self_consistency import self_consistency
+from fb_core.files.ownership import Target
+from fb_core.files.whole import whole_folder
 from fb_core.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
 from fb_core.geometry.camera_paths import PATHS, path_cameras
 from fb_core.geometry.cameras import Pinholes
@@ -28,7 +30,7 @@ from fb_core.geometry.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
 from fb_core.machine import peak_memory_bytes
 from method_configs.complete_options import CHECKED, CompleteOptions, Plan, pose_sampling
-from method_configs.complete_output import COMMAND, NewViews, World, is_ours, write_folder, write_report
+from method_configs.complete_output import KIND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
 
 _WORKING = {
@@ -56,7 +58,8 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     written), and `NoCameras` when the cameras of fewer than two photos can be trusted (then the folder has report and sheet, no capture).
     """
     source, output = source.absolute(), output.absolute()
-    _check_output(output, source, overwrite)
+    target = _target(source, output, options, overwrite)
+    target.check()
     clock = _Clock()
     with clock.stage("reading"):
         job = _read(source, options)
@@ -66,7 +69,7 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     enough = len(found.trusted) >= FEWEST
     report = report_of(source, options, job.photos, job.left_out, model, found, told)
     try:
-        with whole_folder(output) as folder:
+        with whole_folder(target) as folder:
             with clock.stage("writing"):
                 world = job.world if enough or not found.trusted else dataclasses.replace(job.world, points_path=None)
                 write_folder(folder, job.photos, job.left_out, found, new, world, fps=options.fps)
@@ -99,16 +102,12 @@ class Job:
         return all(photo.camera is not None for photo in self.photos)
 
 
-def _check_output(output: Path, source: Path, overwrite: bool) -> None:
-    """An output never sweeps away the input, nor anything but an earlier output."""
-    if source == output or output in source.parents:
-        raise ValueError(f"--output {output} holds the input; choose another folder")
-    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
-        return
-    if not overwrite:
-        raise ValueError(f"--output {output} exists already; choose another folder, or replace it with --overwrite")
-    if not is_ours(output):
-        raise ValueError(f"--output {output} was not made by {COMMAND}, so that --overwrite does not touch it; choose another folder")
+def _target(source: Path, output: Path, options: CompleteOptions, overwrite: bool) -> Target:
+    """The output, and all that the command reads: photos, known cameras, model, text encoder, camera path."""
+    path = [Path(options.path)] if options.path.lower().endswith(".json") else []
+    given = [source, options.known_poses, options.model, options.text_encoder, *path]
+    inputs = tuple(one for one in given if one is not None)
+    return Target(folder=output, kind=KIND, overwrite=overwrite, inputs=inputs, earlier=is_ours)
 
 
 def _read(source: Path, options: CompleteOptions) -> Job:
@@ -132,7 +131,7 @@ def _world_of(folder: Path) -> World:
     capture = read_capture(folder)
     return World(
         extra={key: value for key, value in capture.extra.items() if key not in _WORKING},
-        points_path=capture.points_path if capture.points_path is not None and capture.points_path.is_file() else None,
+        points_path=own_points(capture),
         straight=frozenset(frame.image_path for frame in capture.frames if not any(frame.distortion.values())),
     )
 

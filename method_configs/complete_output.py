@@ -20,13 +20,17 @@ from fb_core.data.photos import Photo
 from fb_core.data.points import Points, read_points
 from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
+from fb_core.files.faults import is_of_the_disk
 from fb_core.fly_through import FoundCameras
 from fb_core.geometry.cameras import Pinholes
 from fb_core.json_files import read_json
 
 REPORT_NAME = "report.json"
 COMMAND = "fillerbuster complete"
-"""What the report says of its origin; a folder with such a report may be replaced."""
+"""What the report says of its origin."""
+KIND = "completed scene"
+"""What the folder's mark says."""
+_WRITTEN = {"images", "masks", "raymaps", "transforms.json", "points3D.ply", "fly-through.mp4", "sheet.png", "cameras.png", REPORT_NAME}
 _CHANNELS = tuple(f"{kind}.{axis}" for kind in ("origin", "direction") for axis in "xyz")
 _SHOWN_SIDE = 256
 _MODEL = "PINHOLE"
@@ -92,8 +96,10 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
 
 
 def is_ours(folder: Path) -> bool:
-    """Whether this command made the folder."""
+    """Whether a version of this command that wrote no marks made the folder, and nobody has put anything into it since."""
     try:
+        if {entry.name for entry in folder.iterdir()} - _WRITTEN:
+            return False
         report = read_json(folder / REPORT_NAME)
     except (OSError, ValueError):
         return False
@@ -201,6 +207,9 @@ def _draw(path: Path, photos: list[Photo], found: FoundCameras, new: NewViews | 
     try:
         draw_cameras(path, [found.camera(index) for index in trusted], pictures, new=None if new is None else new.cameras, points=points)
     except (ImportError, RuntimeError, OSError) as error:
+        if is_of_the_disk(error):
+            raise
+        path.unlink(missing_ok=True)
         _logger.warning("cameras.png is left out, for this machine draws nothing off-screen: %s", error)
 
 

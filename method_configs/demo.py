@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import threading
 import time
 import warnings
@@ -18,7 +17,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from fb_core.files.ownership import MARK_NAME, Target, mark_text
+from fb_core.files.whole import remove_folder, whole_file
 from fb_core.machine import usable_cores
+from method_configs.earlier_runs import clear_run
 from method_configs.training_process import TrainingProcess
 
 if TYPE_CHECKING:
@@ -30,8 +32,9 @@ FAMILY, VIEWS, SIZE, HELD_OUT = "narrow", 24, 128, 16
 """The capture: a room of the family that the bundled model knows."""
 ROUNDS = 4
 """Passes of the diffusion model: the anchors and three densify rounds."""
-MARKER = ".fillerbuster-demo"
+MARKER = MARK_NAME
 """File that marks a folder as a demo's own, which a later demo may replace."""
+_EARLIER_MARKER = ".fillerbuster-demo"  # of versions before all commands had one kind of mark
 
 _logger = logging.getLogger(__name__)
 
@@ -49,7 +52,7 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
         raise ValueError(f"iterations: expected at least 1, got {iterations}")
     read_config(model or BUNDLED_MODEL)  # a missing model is told before anything is made
     output = output.absolute()
-    _clear(output)
+    _clear(output, inputs=() if model is None else (model,))
     clock = _Clock()
     with _peak_memory() as memory, _Bars() as bars:
         with clock.stage("capture"), bars.stage("Room capture") as bar:
@@ -66,7 +69,8 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
             write_report(output, views, quality, seed=seed)
             bar(1, 1)
     metrics = {**_rounded(quality), "seconds": clock.rounded(), "peak_memory_gib": round(memory["gib"], 3)}
-    (output / "metrics.json").write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with whole_file(output / "metrics.json") as unfinished:
+        unfinished.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     _summarize(metrics, output)
     return metrics
 
@@ -140,17 +144,30 @@ def _render_both(output: Path, bars: _Bars) -> dict[str, HeldOutViews]:
     return views
 
 
-def _clear(output: Path) -> None:
-    """Make the folder, empty but for the marker; only an earlier demo is removed."""
-    if output.exists():
-        if not output.is_dir() or (any(output.iterdir()) and not (output / MARKER).exists()):
-            raise ValueError(f"output {output} holds other things than a demo; choose a new folder")
-        for entry in ("capture", "runs"):
-            shutil.rmtree(output / entry, ignore_errors=True)
-        for entry in ("report.png", "metrics.json"):
-            (output / entry).unlink(missing_ok=True)
-    output.mkdir(parents=True, exist_ok=True)
-    (output / MARKER).touch()
+def _clear(output: Path, *, inputs: tuple[Path, ...] = ()) -> None:
+    """Make the folder, empty but for the marker; only an earlier demo is removed, and nothing in it that no demo makes."""
+    Target(folder=output, kind="demo", overwrite=True, inputs=inputs, earlier=_is_earlier_demo).check()
+    with whole_file(output / MARKER) as unfinished:
+        unfinished.write_text(mark_text("demo", []), encoding="utf-8")
+    for method in METHODS.values():
+        clear_run(run_folder(output, method), output)
+    remove_folder(Target(folder=output / "capture", kind="capture", overwrite=True, inputs=inputs, earlier=_is_room))
+    for entry in ("report.png", "metrics.json", _EARLIER_MARKER):
+        (output / entry).unlink(missing_ok=True)
+
+
+def _is_earlier_demo(folder: Path) -> bool:
+    return (folder / _EARLIER_MARKER).is_file()
+
+
+def _is_room(capture: Path) -> bool:
+    """Whether a capture without a mark says that it shows a procedural room."""
+    from fb_core.data.transforms_json import JSON_NAME, load_transforms
+
+    try:
+        return "room" in load_transforms(capture / JSON_NAME)
+    except (OSError, ValueError):
+        return False
 
 
 class _Clock:

@@ -6,7 +6,10 @@ import logging
 from pathlib import Path
 from typing import Literal
 
-from fb_nerfstudio.export import write_export
+from fb_core.data.captures import Capture
+from fb_core.data.own_files import own_points
+from fb_core.files.ownership import Target
+from fb_nerfstudio.export import KIND, write_export
 from fb_nerfstudio.saved_run import gaussian_centers, read_completed
 from method_configs.finished_run import quiet, read_run
 
@@ -32,15 +35,22 @@ def export_run(
     try:
         with quiet():
             completed = read_completed(config, checkpoint)
-        points = None if completed.capture.points_path is not None else gaussian_centers(config, checkpoint, completed.world)
+        points = gaussian_centers(config, checkpoint, completed.world) if own_points(completed.capture) is None else None
     except ValueError as error:
         raise ValueError(f"run {run}: {error}") from error
     if not completed.finished:
         _logger.warning("run %s: its generation was interrupted; only the rounds that were finished are exported", run)
     try:
-        pictures = write_export(completed, folder, format=format, points=points, held_out=held_out, overwrite=overwrite)
+        target = Target(folder=folder, kind=KIND, overwrite=overwrite, inputs=_read(run, completed.capture))
+        pictures = write_export(completed, target, format=format, points=points, held_out=held_out)
     except (OSError, ValueError) as error:
         raise ValueError(f"export: {error}; nothing was written") from error
     generated = len(completed.generated)
     _logger.info("wrote %d captured and %d generated views to %s", pictures - generated, generated, folder)
     return folder
+
+
+def _read(run: Path, capture: Capture) -> tuple[Path, ...]:
+    """All that an export reads: the run's options and checkpoints, and the capture with folders of pictures elsewhere."""
+    elsewhere = {frame.image_path.resolve().parent for frame in capture.frames}
+    return (run / "config.yml", run / "nerfstudio_models", capture.root, *sorted(elsewhere))

@@ -1,4 +1,4 @@
-"""A finished run of ``ns-train``, loaded as nerfstudio's evaluation commands load it, without their messages."""
+"""A finished run of ``ns-train``, loaded without nerfstudio's messages, and without running anything that its files name."""
 
 from __future__ import annotations
 
@@ -26,40 +26,62 @@ def quiet() -> Iterator[None]:
 def load_run(run: Path) -> Any:
     """The pipeline of the run whose folder holds config.yml, from its latest checkpoint, in evaluation mode.
 
-    Raises ValueError when there is no run in the folder, when it has no checkpoint yet, and when it is of another method.
-    """
-    _latest_checkpoint(run)
-    from nerfstudio.utils.eval_utils import eval_setup
+    The same as nerfstudio's ``eval_setup`` gives, but for what it does with files: options and weights are read as plain values.
 
-    from fb_nerfstudio.datamanager import FillerbusterDataManager
+    Raises ValueError as :func:`read_run`.
+    """
+    config, state = read_run(run)
+    import torch
 
     with quiet():
-        pipeline: Any = eval_setup(run / "config.yml", test_mode="test")[1].eval()
-    if not isinstance(pipeline.datamanager, FillerbusterDataManager):
-        name = type(pipeline.datamanager).__name__
-        raise ValueError(f"run {run}: expected a run of fillerbuster or fillerbuster-none, got one with {name}")
+        pipeline = config.pipeline.setup(device=torch.device("cuda" if torch.cuda.is_available() else "cpu"), test_mode="test").eval()
+        pipeline.load_pipeline(state["pipeline"], state["step"])
     return pipeline
 
 
 def read_run(run: Path) -> tuple[Any, dict[str, Any]]:
     """Trainer config and latest checkpoint of a run, on the CPU; nothing is built from them.
 
-    Raises ValueError when there is no run in the folder, and when it has no checkpoint yet or a broken one.
+    Raises ValueError when there is no run in the folder, when its config.yml names anything but what a run of ours is made of (as a run
+    of another method does), and when it has no checkpoint yet or a broken one.
     """
     path = _latest_checkpoint(run)
     import torch
-    import yaml
 
-    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    from fb_nerfstudio.run_config import read_run_config
+
+    config = read_run_config(run / "config.yml")
+    _require_our_parts(run, config)
     try:
-        return config, torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(
             f"run {run}: its checkpoint {path.name} cannot be read ({error}); restore it, or remove it for the one before"
         ) from error
+    if not (isinstance(state, dict) and isinstance(state.get("pipeline"), dict) and isinstance(state.get("step"), int)):
+        raise ValueError(f"run {run}: {path.name} is no checkpoint of ns-train; restore it, or remove it for the one before")
+    return config, state
+
+
+def _require_our_parts(run: Path, config: Any) -> None:
+    """Raises ValueError for options of another pipeline, datamanager or model than ours, before any of them is built."""
+    from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+    from fb_nerfstudio.datamanager import FillerbusterDataManagerConfig
+    from fb_nerfstudio.splat_model import FillerbusterSplatModelConfig
+
+    parts = {
+        VanillaPipelineConfig: config.pipeline,
+        FillerbusterDataManagerConfig: getattr(config.pipeline, "datamanager", None),
+        FillerbusterSplatModelConfig: getattr(config.pipeline, "model", None),
+    }
+    for kind, part in parts.items():
+        if not isinstance(part, kind):
+            raise ValueError(f"run {run}: expected a run of fillerbuster or fillerbuster-none, got one with {type(part).__name__}")
 
 
 def _latest_checkpoint(run: Path) -> Path:
+    """The file. Raises ValueError when there is no run in the folder, or no checkpoint."""
     if not (run / "config.yml").is_file():
         raise ValueError(f"run {run}: no config.yml there; give the folder that ns-train has made (output/experiment/method/time)")
     checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))

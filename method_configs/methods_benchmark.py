@@ -17,8 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from fb_core.files.ownership import Target
+from fb_core.files.whole import whole_file, whole_folder
 from fb_core.machine import usable_cores
 from method_configs.demo import FAMILY, run_folder, training_arguments
+from method_configs.earlier_runs import clear_run
 from method_configs.training_process import TrainingProcess
 
 if TYPE_CHECKING:
@@ -119,25 +122,27 @@ def cut_blocks(plain: Path, cut: Path, *, share: float, block_in: Literal["pictu
     from fb_core.data.captures import read_capture
 
     capture = read_capture(plain)
-    shutil.copytree(plain, cut)
-    content = json.loads((cut / "transforms.json").read_text(encoding="utf-8"))
-    captured = [name in content["train_filenames"] for name in (frame["file_path"] for frame in content["frames"])]
     cameras = [frame.camera for frame in capture.frames]
-    cube = _cube(capture, [camera for camera, one in zip(cameras, captured, strict=True) if one], share) if block_in == "world" else None
-    (cut / "masks").mkdir(exist_ok=True)
-    for frame, camera, one in zip(content["frames"], cameras, captured, strict=True):
-        image = media.read_image(cut / frame["file_path"])
-        known = torch.ones_like(image[:1])
-        if one:
-            if cube is None:
-                rows, columns = (_middle(side, share) for side in image.shape[1:])
-                known[:, rows, columns] = 0
-            else:
-                known[:, shows_cube(camera, *cube)] = 0
-            media.write_image(cut / frame["file_path"], image * known)
-        frame["mask_path"] = f"masks/{Path(frame['file_path']).stem}.png"
-        media.write_image(cut / frame["mask_path"], known)
-    (cut / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    with whole_folder(Target(folder=cut, kind="capture", inputs=(plain,))) as unfinished:
+        shutil.copytree(plain, unfinished, dirs_exist_ok=True)
+        content = json.loads((unfinished / "transforms.json").read_text(encoding="utf-8"))
+        captured = [name in content["train_filenames"] for name in (frame["file_path"] for frame in content["frames"])]
+        theirs = [camera for camera, one in zip(cameras, captured, strict=True) if one]
+        cube = _cube(capture, theirs, share) if block_in == "world" else None
+        (unfinished / "masks").mkdir(exist_ok=True)
+        for frame, camera, one in zip(content["frames"], cameras, captured, strict=True):
+            image = media.read_image(unfinished / frame["file_path"])
+            known = torch.ones_like(image[:1])
+            if one:
+                if cube is None:
+                    rows, columns = (_middle(side, share) for side in image.shape[1:])
+                    known[:, rows, columns] = 0
+                else:
+                    known[:, shows_cube(camera, *cube)] = 0
+                media.write_image(unfinished / frame["file_path"], image * known)
+            frame["mask_path"] = f"masks/{Path(frame['file_path']).stem}.png"
+            media.write_image(unfinished / frame["mask_path"], known)
+        (unfinished / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def shows_cube(camera: Pinholes, center: Tensor, side: float) -> Tensor:
@@ -191,12 +196,13 @@ def _measured(part: str, method: str, room: int, folder: Path, config: Methods) 
     if (run / _ROW).exists():
         return json.loads((run / _ROW).read_text(encoding="utf-8"))
     _logger.info("room %d, %s: %s", room, part, method)
-    shutil.rmtree(run, ignore_errors=True)
+    clear_run(run, folder)
     row: dict[str, Any] = {"part": part, "method": method, "room": room} | trained(method, folder, room, config)
     row |= quality_of(run, folder / "capture")
     if part == "masked":
         row |= consistency_of(run, folder.with_name(f"room-{room}") / "capture")
-    (run / _ROW).write_text(json.dumps(row, indent=1, allow_nan=False), encoding="utf-8")
+    with whole_file(run / _ROW) as unfinished:
+        unfinished.write_text(json.dumps(row, indent=1, allow_nan=False), encoding="utf-8")
     return row
 
 

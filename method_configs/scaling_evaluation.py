@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from fb_core.files.whole import whole_file
+
 if TYPE_CHECKING:
     from fb_core.evaluation.benchmarks import Report
 
@@ -70,7 +72,7 @@ def draw(report: Report, path: Path) -> None:
         axes.set_xlabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("PSNR of the hidden views (dB)")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=150)
     pyplot.close(figure)
     _logger.info("wrote %s", path)

@@ -44,7 +44,6 @@ def write_sheet(run: Path, output: Path, *, before: Path | None = None) -> None:
         for role in dict.fromkeys(one.role for one in bank.origins):
             strips += _generated(models, f"Generated, {role}", bank, [i for i, one in enumerate(bank.origins) if one.role == role])
     strips += _captured(models, "Held-out views", manager.cached_eval, manager.eval_dataset.cameras)
-    output.parent.mkdir(parents=True, exist_ok=True)
     count = f"{len(manager.train_dataset)} captured and {0 if bank is None else len(bank)} generated views"
     title, subtitle = f"{run.parent.parent.name}, {run.parent.name}", f"{count}, {pipeline.model.num_points} Gaussians"
     write_contact_sheet(output, strips, title=title, subtitle=subtitle, columns=COLUMNS)

@@ -14,6 +14,7 @@ import typing
 from collections.abc import Sequence
 from pathlib import Path
 
+from fb_core.files.faults import sentence_of
 from method_configs.training_command import train_preset
 
 
@@ -25,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         train_preset(**vars(parser().parse_args(arguments)))
     except (ValueError, FloatingPointError, OSError) as error:
-        sys.exit(f"Error: {error}")
+        sys.exit(f"Error: {sentence_of(error)}")
 
 
 def parser() -> argparse.ArgumentParser:

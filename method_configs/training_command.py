@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from fb_core.checkpoint import model_target, require_model_or_free
 from fb_core.data.training_data import TrainingData
 from fb_core.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.training.distributed import Group, joined
@@ -74,6 +75,8 @@ def train_preset(
     flags = {"recompute": recompute, "shard": shard, "tensorboard": tensorboard}
     changes = {name: value for name, value in chosen.items() if value is not None} | {name: True for name, value in flags.items() if value}
     engine = dataclasses.replace(recipe.engine, **changes)
+    if not dry_run:
+        require_model_or_free(model_target(output / "model", overwrite=True))  # before days of training, not after them
     with joined(_device(device)) as (group, where):
         if dry_run:
             for name in stages:

@@ -10,6 +10,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO
+
+from fb_core.files.faults import CannotWrite
 
 Report = Callable[[str, int, int], None]
 """(phase, done, total); the phase is ``generate`` (denoising steps of all rounds) or ``train`` (iterations)."""
@@ -38,8 +41,14 @@ class TrainingProcess:
         self._iterations, self._rounds, self._report = iterations, rounds, report
         self._began = time.monotonic()
         self._generating_since: float | None = None
+        self._tail = ""  # of what it prints, also where its log cannot be written
+        self._unwritten: CannotWrite | None = None
         # A forced terminal makes rich print the bars of the generation into the pipe, where they are read below.
         surroundings = {"FORCE_COLOR": "1", "TERM": "xterm-256color", "COLUMNS": "120", "PYTHONUNBUFFERED": "1"}
+        try:
+            opened = log.open("wb", buffering=0)  # each piece is on the disk at once, for whoever looks at the file
+        except OSError as error:
+            raise CannotWrite(log, error) from error
         self._child = subprocess.Popen(
             [str(Path(sys.executable).with_name("ns-train")), *arguments],
             stdin=subprocess.DEVNULL,
@@ -47,7 +56,7 @@ class TrainingProcess:
             stderr=subprocess.STDOUT,
             env={**os.environ, **surroundings, "OMP_NUM_THREADS": str(threads)},
         )
-        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader = threading.Thread(target=self._read, args=(opened,), daemon=True)
         self._reader.start()
 
     @property
@@ -65,9 +74,10 @@ class TrainingProcess:
         code = self._child.wait()
         self._reader.join()
         if code != 0:
-            lines = [line for line in self.log.read_text(encoding="utf-8").splitlines() if line.strip()]
+            lines = [line for line in self._tail.splitlines() if line.strip()]
             last = lines[-1].strip() if lines else "no output"
-            raise ValueError(f"ns-train {self.name} ended with code {code}: {last} (all of its output: {self.log})")
+            where = f"all of its output: {self.log}" if self._unwritten is None else str(self._unwritten)
+            raise ValueError(f"ns-train {self.name} ended with code {code}: {last} ({where})")
 
     def stop(self) -> None:
         """End the training if it still runs."""
@@ -79,18 +89,26 @@ class TrainingProcess:
                 self._child.kill()
         self._reader.join(timeout=10)
 
-    def _read(self) -> None:
+    def _read(self, log: IO[bytes]) -> None:
         assert self._child.stdout is not None
         window = ""
-        with self.log.open("w", encoding="utf-8") as log:
+        with log:
             while chunk := os.read(self._child.stdout.fileno(), 1 << 16):
                 text = chunk.decode("utf-8", errors="replace")
                 window = (window + text)[-_WINDOW:]
-                log.write(_ESCAPES.sub("", text))
-                log.flush()
+                self._keep(log, _ESCAPES.sub("", text))
                 self._follow(_ESCAPES.sub("", window))
         self._child.stdout.close()
         self.seconds["all"] = time.monotonic() - self._began
+
+    def _keep(self, log: IO[bytes], text: str) -> None:
+        """Write to the log while that is possible. The pipe is read on in any case, or the training would wait for ever."""
+        self._tail = (self._tail + text)[-_WINDOW:]
+        if self._unwritten is None:
+            try:
+                log.write(text.encode())
+            except OSError as error:
+                self._unwritten = CannotWrite(self.log, error)
 
     def _follow(self, text: str) -> None:
         """Report the latest progress that ``text`` tells of."""

@@ -20,6 +20,7 @@ from test_cameras import random_cameras
 from fb_core.data import media
 from fb_core.data.captures import Capture, FrameToWrite, Points, read_capture, validate_capture, write_capture, write_transforms
 from fb_core.data.transforms_json import camera_entry, camera_from
+from fb_core.files.ownership import MARK_NAME
 
 
 def edited(folder: Path, change) -> Path:
@@ -525,14 +526,15 @@ def test_a_full_folder_is_not_touched(tiny_capture: Path) -> None:
         write_capture(tiny_capture, [one_frame()])
     assert sorted(path.name for path in tiny_capture.rglob("*")) == before
     assert len(write_capture(tiny_capture, [one_frame()], overwrite=True)) == 1
-    assert sorted(path.name for path in tiny_capture.rglob("*")) == ["a.png", "images", "transforms.json"], "nothing of the old one stays"
+    names = sorted(path.name for path in tiny_capture.rglob("*"))
+    assert names == [MARK_NAME, "a.png", "images", "transforms.json"], "nothing of the old one stays"
     assert [path.name for path in tiny_capture.parent.iterdir()] == [tiny_capture.name], "no temporary folders stay"
 
 
 def test_overwrite_does_not_sweep_away_other_things(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "diary.txt").write_text("dear")
-    with pytest.raises(ValueError, match="holds other things than a capture"):
+    with pytest.raises(ValueError, match="holds something else than an earlier capture"):
         write_capture(tmp_path / "home", [one_frame()], overwrite=True)
     with pytest.raises(ValueError, match="not empty"):
         write_capture(tmp_path / "home" / "diary.txt", [one_frame()])

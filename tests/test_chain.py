@@ -21,8 +21,10 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import writer
+from nerfstudio.utils.eval_utils import eval_setup
 from tiny_models import save_tiny_model
 
 from fb_core.data import media
@@ -31,8 +33,10 @@ from fb_core.data.room_captures import rooms
 from fb_core.inpainter import Fillerbuster
 from fb_nerfstudio import datamanager as datamanager_module
 from fb_nerfstudio.datamanager import FillerbusterDataManager
+from fb_nerfstudio.run_config import read_run_config
 from fb_nerfstudio.splat_model import FillerbusterSplatModel
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
+from method_configs.finished_run import load_run
 from method_configs.splats import fillerbuster
 
 VIEWS, HELD_OUT, SIDE = 8, 2, 32
@@ -277,9 +281,17 @@ def test_ns_viewer_shows_the_generated_views(chain: Chain, monkeypatch: pytest.M
             one.viser_server.stop()
 
 
-def test_the_saved_run_is_ours(chain: Chain):
-    from nerfstudio.utils.eval_utils import eval_setup
+def test_our_reading_of_config_yml_is_nerfstudios_own(chain: Chain):
+    """Equal options, down to the text that they are written as; and the same splats as by nerfstudio's eval_setup."""
+    text = chain.config_file.read_text()
+    config = read_run_config(chain.config_file)
+    assert config == yaml.load(text, Loader=yaml.Loader) and yaml.dump(config) == text
+    ours, theirs = load_run(chain.resumed).state_dict(), eval_setup(chain.config_file, test_mode="test")[1].state_dict()
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours if isinstance(ours[name], torch.Tensor))
 
+
+def test_the_saved_run_is_ours(chain: Chain):
     config, pipeline, _, step = eval_setup(chain.config_file, test_mode="inference")
     assert isinstance(config, FillerbusterTrainerConfig) and isinstance(pipeline.model, FillerbusterSplatModel)
     assert step == STEPS_AFTER_RESUME and len(pipeline.datamanager.generated_views) == ANCHORS + DENSIFIED

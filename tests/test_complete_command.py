@@ -26,6 +26,7 @@ from fb_core.data.points import Points, read_points
 from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import write_contact_sheet
 from fb_core.evaluation.pose_metrics import pose_errors
+from fb_core.files.ownership import MARK_NAME
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d
 from method_configs import commands, complete_command, complete_output
@@ -91,7 +92,7 @@ def test_a_posed_capture_becomes_a_completed_one(tmp_path: Path, model: Path):
     assert set(report["seconds"]) >= {"reading", "cameras", "new views", "writing"} and report["peak_memory_gib"] > 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
     wanted = {"transforms.json", "images", "points3D.ply", "fly-through.mp4", "sheet.png", "cameras.png", "report.json"}
-    assert names == wanted and [path for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    assert names == wanted | {MARK_NAME} and [path for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     with av.open(str(tmp_path / "out" / "fly-through.mp4")) as film:
         assert len(list(film.decode(video=0))) == 5
     stock, ours = (reader(NerfstudioDataParserConfig(data=tmp_path / "out")) for reader in (Nerfstudio, NerfstudioWithoutOpen3d))
@@ -137,7 +138,7 @@ def test_cameras_are_never_made_up(tmp_path: Path, model: Path, capsys):
     told = refusal(capsys, tmp_path / "photos", tmp_path / "out", model, "--cameras", "model")
     assert "expected at least two that can be trusted, got 0" in told and "try --cameras features" in told and "None was made up" in told
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"report.json", "sheet.png", "raymaps"}
+    assert names == {"report.json", "sheet.png", "raymaps", MARK_NAME}
     assert [one["used"] for one in json.loads((tmp_path / "out" / "report.json").read_text())["photos"]] == [False] * 3
     told = refusal(capsys, tmp_path / "photos", tmp_path / "out", model, "--overwrite")  # features find none either at this size
     assert "--known-poses" in told

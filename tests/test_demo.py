@@ -129,7 +129,7 @@ def test_report_shows_captured_generated_and_held_out_views(tiny_capture, tmp_pa
 
 def test_only_an_earlier_demo_is_cleared_away(tmp_path, capsys):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ValueError, match="holds other things than a demo"):
+    with pytest.raises(ValueError, match="holds something else than an earlier demo"):
         demo._clear(tmp_path)
     demo._clear(tmp_path / "new" / "demo")
     (tmp_path / "new" / "demo" / "report.png").touch()

@@ -27,7 +27,8 @@ from fb_core.data import media
 from fb_core.data.captures import FrameToWrite, read_capture, validate_capture, write_capture
 from fb_core.data.colmap_model import ColmapImage, quaternions_of, rotations_of, write_colmap
 from fb_core.data.points import Points, read_points
-from fb_core.data.whole_folder import whole_folder
+from fb_core.files.ownership import Target
+from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.similarity import Similarity, nearest_rotations
 from fb_nerfstudio import export as export_module
@@ -468,7 +469,7 @@ def test_a_full_disk_leaves_nothing_half_written(run: Path, tmp_path: Path, caps
 
 def test_a_folder_is_whole_or_absent_whatever_ends_the_writing(tmp_path: Path):
     for end in (KeyboardInterrupt, SystemExit, ValueError):
-        with pytest.raises(end), whole_folder(tmp_path / "new") as unfinished:
+        with pytest.raises(end), whole_folder(Target(folder=tmp_path / "new", kind="test")) as unfinished:
             (unfinished / "file").write_text("half")
             raise end
         assert list(tmp_path.iterdir()) == []

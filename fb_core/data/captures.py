@@ -32,7 +32,8 @@ from fb_core.data.transforms_json import (
     to_json,
 )
 from fb_core.data.undistort import check_lens, undistort
-from fb_core.data.whole_folder import whole_folder
+from fb_core.files.ownership import Target
+from fb_core.files.whole import settled, whole_file, whole_folder
 from fb_core.geometry.cameras import Pinholes
 
 FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
@@ -162,6 +163,8 @@ def read_capture(folder: str | Path) -> Capture:
     """
     path = Path(folder)
     if not path.exists():
+        settled(path.parent if path.suffix.lower() == ".json" else path)
+    if not path.exists():
         raise ValueError(f"capture {path}: no such folder; check the path")
     if path.is_dir():
         path = path / JSON_NAME
@@ -236,9 +239,9 @@ def write_transforms(capture: Capture, folder: str | Path, *, overwrite: bool = 
         meta["ply_file_path"] = _relative(capture.points_path, folder)
     meta["frames"] = [_frame_entry(frame, capture.root, folder, with_model=len(models) > 1) for frame in capture.frames]
     folder.mkdir(parents=True, exist_ok=True)
-    unfinished = folder / f".{JSON_NAME}.{os.getpid()}"
-    unfinished.write_text(to_json(meta, str(target)))
-    os.replace(unfinished, target)
+    text = to_json(meta, str(target))
+    with whole_file(target) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
     return target
 
 
@@ -254,7 +257,7 @@ def split_lists(frames: Sequence[Frame], root: Path) -> dict[str, list[str]]:
 
 
 def write_capture(
-    folder: str | Path,
+    folder: str | Path | Target,
     frames: Sequence[FrameToWrite],
     *,
     points: Points | None = None,
@@ -267,29 +270,24 @@ def write_capture(
     and then renamed, so the folder is there whole or not at all.
 
     Args:
-        folder: where the capture goes; it may exist if it is empty.
+        folder: where the capture goes; it may exist if it is empty. As a target it says itself what may be replaced.
         frames: at least one, with names of their own.
         points: coloured points in the world of the cameras.
         extra: further top-level JSON keys, e.g. ``orientation_override``; values of plain JSON types.
-        overwrite: replace the capture that the folder holds now.
+        overwrite: replace the capture that the folder holds now, if it was written by this function.
 
     Returns:
         The capture as :func:`read_capture` reads it.
     """
-    folder, extra = Path(folder), extra or {}
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not overwrite:
-            raise ValueError(f"write_capture: {folder} exists and is not empty; choose another folder or pass overwrite=True")
-        if not (folder / JSON_NAME).is_file():  # never sweep away a folder that is something else
-            raise ValueError(f"write_capture: {folder} holds other things than a capture (no {JSON_NAME}); choose another folder")
+    target, extra = folder if isinstance(folder, Target) else Target(folder=Path(folder), kind="capture", overwrite=overwrite), extra or {}
     _check_to_write(frames, extra)
-    with whole_folder(folder) as unfinished:
+    with whole_folder(target) as unfinished:
         written = tuple(_write_frame(frame, unfinished, any(one.mask is not None for one in frames)) for frame in frames)
         if points is not None:
             write_points(unfinished / "points3D.ply", points)
         points_path = None if points is None else unfinished / "points3D.ply"
         write_transforms(Capture(root=unfinished, frames=written, points_path=points_path, extra=extra), unfinished)
-    return read_capture(folder)
+    return read_capture(target.folder)
 
 
 # ---- reading --------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data.film_colours import tag, to_yuv420
+from fb_core.files.whole import by_way_of_memory
 
 _QUALITY = "12"  # constant rate factor: even fields come back within 1 of 255 (3 at 18, the customary one for no visible loss)
 _CHROMA_PLACE = "chromaloc=1"  # in the middle of the four pixels that share it
@@ -34,7 +35,7 @@ def write_film(path: Path, frames: Iterable[Float[Tensor, "3 h w"]], *, frames_p
 
     size: tuple[int, ...] = ()
     count = 0
-    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+    with by_way_of_memory(path) as place, av.open(place, "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream: Any = None
         for picture in frames:
             pixels = _even_pixels(picture)

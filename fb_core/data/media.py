@@ -18,6 +18,7 @@ from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.files.whole import by_way_of_memory
 from fb_core.limits import require_decodable
 
 HEIF_SUFFIXES = (".heic", ".heif")
@@ -322,9 +323,11 @@ def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: 
         spec.channelnames = tuple(names)
     for key, value in attributes.items():
         spec.attribute(key, value)
-    done = writer.open(str(path), spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()
-    if not done:
-        raise ValueError(f"cannot write {path} ({_one_line(writer.geterror())}); check that the folder exists and has room")
+    # On a full disk OpenImageIO's PNG writer cuts the file short without a word, and its JPEG writer ends the whole process.
+    with by_way_of_memory(path) as place:
+        done = writer.open(place, spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()
+        if not done:
+            raise ValueError(f"cannot write {path} ({_one_line(writer.geterror())}); check that the folder exists and has room")
 
 
 def _one_line(message: str) -> str:

@@ -10,6 +10,7 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from fb_core.data import media, video
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.exif import read_exif
+from fb_core.data.own_files import lies_inside
 from fb_core.data.transforms_json import JSON_NAME
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import resampled
@@ -171,10 +173,15 @@ def _of_capture(folder: Path) -> list[Photo]:
     if len(frames) < len(capture):
         _logger.info("capture %s: %d generated views are left out", folder, len(capture) - len(frames))
     names = _unique_names([frame.image_path.stem for frame in frames])
-    return _readable(folder, [lambda frame=frame, name=name: _captured(frame, name) for frame, name in zip(frames, names, strict=True)])
+    read = partial(_captured, root=capture.root)
+    return _readable(folder, [partial(read, frame, name) for frame, name in zip(frames, names, strict=True)])
 
 
-def _captured(frame: Frame, name: str) -> Photo:
+def _captured(frame: Frame, name: str, *, root: Path) -> Photo:
+    for path in (frame.image_path, frame.mask_path):
+        if path is not None and not lies_inside(path, root):
+            raise ValueError(f"image {path}: outside of the capture {root}, whose pictures are copied; copy it there to have it along")
+
     def pixels() -> Pixels:
         return frame.load_undistorted()[:2]
 

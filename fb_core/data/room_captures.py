@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import secrets
-import shutil
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +23,8 @@ from fb_core.data.points import Points
 from fb_core.data.ray_caster import RoomImages, cast, render
 from fb_core.data.room_cameras import CAMERA_CLEARANCE_METRES, cameras_by_angles, free_positions
 from fb_core.data.rooms import FAMILIES, Room, make_room
+from fb_core.files.ownership import Target
+from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
 
 COVERED_SHARE, UNCOVERED_SHARE = 0.8, 0.4
@@ -211,16 +210,11 @@ def write_room_capture(capture: RoomCapture, output: Path, *, ground_truth: bool
         "val_filenames": held_out_names,
         "test_filenames": held_out_names,
     }
-    output.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = output.parent / f".{output.name}.{secrets.token_hex(4)}"
-    try:
+    with whole_folder(Target(folder=output, kind="capture")) as unfinished:
         write_capture(unfinished, [*taken, *others], points=capture.points, extra=extra)
         if ground_truth:
             _write_ground_truth(unfinished, "captured", capture.images)
             _write_ground_truth(unfinished, "held_out", capture.held_out_images)
-        os.replace(unfinished, output)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _refuse_taken(output: Path) -> None:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import torch
 
+from fb_core.files.whole import whole_file
 from fb_core.machine import usable_cores
 
 OnCell = Callable[[str], None]
@@ -66,8 +67,9 @@ class Report:
             ],
         }
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+        with whole_file(path) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
         return path
 
 

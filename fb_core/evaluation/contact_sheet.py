@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.files.whole import whole_file
+
 _CELL_INCHES = 1.45
 _HEADING_INCHES, _CAPTION_INCHES, _TITLE_INCHES, _MARGIN_INCHES = 0.36, 0.22, 0.62, 0.15
 _HEADING_POINTS, _CAPTION_POINTS, _TITLE_POINTS, _SUBTITLE_POINTS = 12, 9, 17, 11
@@ -45,14 +47,14 @@ def write_contact_sheet(path: Path, strips: Sequence[Strip], *, title: str, subt
     """Draw the strips below each other into a PNG; pixels stay sharp.
 
     Args:
-        path: the picture's file; its folder must exist.
+        path: the picture's file; missing folders are made.
         strips: strips without pictures are left out.
         title: stands at the top.
         subtitle: a second, smaller line.
         columns: pictures per line.
         dpi: pixels per inch; a picture is about 1.4 inches wide.
 
-    Raises ValueError when no strip has a picture.
+    Raises ValueError when no strip has a picture, and CannotWrite when the disk is full; an earlier picture then stands.
     """
     import matplotlib
 
@@ -73,7 +75,8 @@ def write_contact_sheet(path: Path, strips: Sequence[Strip], *, title: str, subt
         for strip in strips:
             _draw_strip(figure, strip, columns, top)
             top -= _strip_inches(strip, columns)
-        figure.savefig(path)
+        with whole_file(path) as unfinished:
+            figure.savefig(unfinished, format="png")
     finally:
         pyplot.close(figure)
 

@@ -33,7 +33,7 @@ class TextEncoder:
             raise ValueError(f"text: expected a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), got {folder}.")
         try:
             tokenizer = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
-            model = CLIPTextModel.from_pretrained(folder, local_files_only=True)
+            model = CLIPTextModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
         except (OSError, ValueError, TypeError) as error:
             reason = str(error).strip().splitlines()[0]
             raise ValueError(f"text: {folder} holds no complete CLIP tokenizer and text model ({reason}).") from error

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from fb_core.files.whole import whole_file
 
 NEWEST = "checkpoint.pt"
 
@@ -36,18 +37,13 @@ class Checkpoints:
         return state
 
     def write(self, state: dict[str, Any]) -> None:
-        """Make ``state`` the newest checkpoint; a kill or a full disk while writing leaves the previous ones whole."""
-        newest, temporary = self.folder / NEWEST, self.folder / f"{NEWEST}.{os.getpid()}"
-        try:
-            with temporary.open("wb") as file:
+        """Make ``state`` the newest checkpoint; a kill or a full disk (CannotWrite) while writing leaves the previous ones whole."""
+        newest = self.folder / NEWEST
+        with whole_file(newest, durable=True) as unfinished:  # else a power cut could leave the new name on an empty file
+            with unfinished.open("wb") as file:  # a file of Python's own says itself that a disk is full
                 torch.save(state, file)
-                file.flush()
-                os.fsync(file.fileno())  # else a power cut could leave the new name on an empty file
             if self.keep > 1 and newest.exists() and self._newest_step not in (None, state["step"]):
                 newest.rename(self.folder / f"checkpoint-{self._newest_step:06d}.pt")
-            temporary.replace(newest)
-        finally:
-            temporary.unlink(missing_ok=True)
         self._newest_step = state["step"]
         for old in self._earlier()[: max(0, len(self._earlier()) - (self.keep - 1))]:
             old.unlink()

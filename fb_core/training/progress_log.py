@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from fb_core.files.faults import CannotWrite
+from fb_core.files.whole import whole_file
 
 _logger = logging.getLogger(__name__)
 
@@ -20,7 +26,8 @@ class ProgressLog:
         for path in (self._path, self._validation):
             if path.exists():
                 kept = [line for line in path.read_text().splitlines() if line.endswith("}") and json.loads(line)["step"] <= from_step]
-                path.write_text("".join(line + "\n" for line in kept))
+                with whole_file(path) as unfinished:
+                    unfinished.write_text("".join(line + "\n" for line in kept))
 
     def add(self, step: int, losses: dict[str, float], speed: dict[str, float]) -> None:
         """Note a step; ``speed`` goes to TensorBoard alone, so that two logs of one training are the same."""
@@ -36,12 +43,14 @@ class ProgressLog:
     def _show(self, group: str, values: dict[str, float], step: int) -> None:
         if self._board is not None:
             for name, value in values.items():
-                self._board.add_scalar(f"{group}/{name}", value, step)
+                with _told(self.folder / "tensorboard"):
+                    self._board.add_scalar(f"{group}/{name}", value, step)
 
     def close(self) -> None:
         """Draw the curves of all losses and of what unseen data say."""
         if self._board is not None:
-            self._board.flush()
+            with _told(self.folder / "tensorboard"):
+                self._board.flush()
         for path, name in ((self._path, "loss.png"), (self._validation, "validation.png")):
             if path.exists():
                 self._draw([json.loads(line) for line in path.read_text().splitlines()], name)
@@ -66,13 +75,32 @@ class ProgressLog:
                 axes.plot([rows[k]["step"] for k in range(0, len(rows), width)], means, label=name)
         axes.set(xlabel="step", ylabel=file.removesuffix(".png"), yscale="log", title=self.title)
         axes.legend()
-        figure.savefig(self.folder / file, dpi=120)
-        pyplot.close(figure)
+        try:
+            with whole_file(self.folder / file) as unfinished:
+                figure.savefig(unfinished, dpi=120)
+        finally:
+            pyplot.close(figure)
 
 
 def _append(path: Path, step: int, values: dict[str, float]) -> None:
-    with path.open("a") as log:
-        log.write(json.dumps({"step": step, **{name: round(value, 6) for name, value in values.items()}}) + "\n")
+    """A further line, whole or not at all."""
+    line = json.dumps({"step": step, **{name: round(value, 6) for name, value in values.items()}}) + "\n"
+    with _told(path), path.open("ab") as log:
+        end = log.tell()
+        try:
+            log.write(line.encode())
+            log.flush()
+        except OSError:
+            os.truncate(path, end)
+            raise
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise CannotWrite(path, error) from error
 
 
 def _board(folder: Path, from_step: int):

@@ -18,6 +18,7 @@ from fb_core.conditioning import encode_in_chunks
 from fb_core.data.sequences import PoolConfig
 from fb_core.data.training_data import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
 from fb_core.data.training_task import Source
+from fb_core.files.whole import whole_file
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
@@ -279,7 +280,8 @@ def _record_spread(task: VAEStage, averaged: dict, folder: Path) -> None:
     values = torch.cat([task.values(-1 - k, range(task.batch)) for k in range(16)])
     mean, _ = task.network.posterior(values)
     rows = {"scaling": 1.0 / float(mean.std()), "views": len(values), **reconstruction_error(task.network, values)}
-    (folder / "spread.json").write_text(json.dumps(rows, indent=1) + "\n")
+    with whole_file(folder / "spread.json") as unfinished:
+        unfinished.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = torch.float32) -> None:

@@ -1,0 +1,108 @@
+"""Which folders a command may replace: those that carry its own mark, and that hold nothing it reads.
+
+Every folder that is written here holds a small file, ``.fillerbuster.json``: who made it, of what kind it is, and the names of all its
+files. A folder without that mark is somebody else's, whatever it looks like; so is every file in it that the mark does not name.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+MARK_NAME = ".fillerbuster.json"
+_MADE_BY, _FORMAT = "fillerbuster", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """The folder that a command is to leave, and what it must not touch for that."""
+
+    folder: Path
+    """Where; it may be there if it is empty."""
+    kind: str
+    """Of what it is to hold, such as ``export``; an earlier folder is replaced by one of its own kind only."""
+    overwrite: bool = False
+    """Replace an earlier one."""
+    inputs: tuple[Path, ...] = ()
+    """Files and folders that the command reads."""
+    earlier: Callable[[Path], bool] | None = None
+    """Whether a folder without a mark is beyond doubt one that an older version of this program has made."""
+
+    def check(self) -> None:
+        """Raises ValueError in one sentence for a folder that must not be written. Links are neither followed nor replaced."""
+        folder = self.folder
+        if folder.is_symlink():
+            raise ValueError(f"{folder} is a link, which is neither followed nor replaced; choose another folder")
+        if not folder.exists():
+            return
+        if not folder.is_dir():
+            raise ValueError(f"{folder} exists already and is not empty, for it is a file; choose another name")
+        for given in self.inputs:
+            if _is_or_holds(folder, given):
+                raise ValueError(f"{folder} holds the input {given}; choose another folder")
+        if not any(folder.iterdir()):
+            return
+        if not self.overwrite:
+            raise ValueError(f"{folder} exists already and is not empty; choose another folder, or replace it with --overwrite")
+        for given in self.inputs:
+            if given.is_dir() and _is_or_holds(given, folder):
+                raise ValueError(f"{folder} lies in the input {given}, so that --overwrite does not touch it; choose a folder outside")
+        if not (kind_of(folder) == self.kind or (kind_of(folder) is None and self.earlier is not None and self.earlier(folder))):
+            raise ValueError(
+                f"{folder} holds something else than an earlier {self.kind}, so that --overwrite does not touch it; choose another folder"
+            )
+
+
+def as_target(folder: Path | Target, kind: str) -> Target:
+    """A plain folder as a target that replaces nothing."""
+    return folder if isinstance(folder, Target) else Target(folder=folder, kind=kind)
+
+
+def write_mark(folder: Path, kind: str) -> None:
+    """The mark of a finished folder. It is the same for the same content."""
+    (folder / MARK_NAME).write_text(mark_text(kind, _files(folder)), encoding="utf-8")
+
+
+def mark_text(kind: str, files: list[str]) -> str:
+    """What stands in a mark."""
+    return json.dumps({"made_by": _MADE_BY, "kind": kind, "format": _FORMAT, "files": sorted(files)}, indent=1) + "\n"
+
+
+def kind_of(folder: Path) -> str | None:
+    """What the folder's mark says that it holds; None without a mark."""
+    told = _mark(folder)
+    return None if told is None else str(told.get("kind"))
+
+
+def foreign_files(folder: Path) -> list[str]:
+    """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no mark tells."""
+    told = _mark(folder)
+    own = told.get("files") if told is not None else None
+    return sorted(set(_files(folder)) - set(own)) if isinstance(own, list) else []
+
+
+def _mark(folder: Path) -> dict | None:
+    path = folder / MARK_NAME
+    try:
+        told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
+    except (OSError, ValueError):
+        return None
+    return told if isinstance(told, dict) and told.get("made_by") == _MADE_BY else None
+
+
+def _files(folder: Path) -> list[str]:
+    """All files and links, at any depth, without the mark."""
+    found = []
+    for where, folders, files in os.walk(folder):
+        links = [name for name in folders if os.path.islink(os.path.join(where, name))]
+        found += [Path(where, name).relative_to(folder).as_posix() for name in (*files, *links)]
+    return [name for name in found if name != MARK_NAME]
+
+
+def _is_or_holds(folder: Path, other: Path) -> bool:
+    """Whether ``other`` is the folder or lies in it. Real places are compared, so that links, ``..`` and bind mounts deceive nobody."""
+    real = Path(os.path.realpath(other))
+    return any(place.exists() and place.samefile(folder) for place in (real, *real.parents))
