@@ -115,8 +115,16 @@ def conditional_validation_loss(
     """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
     images, known = room.images.to(model.device), known.to(model.device)
     rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras))).to(model.device)
-    vaes = {"image_vae": model.image_vae, "raymap_vae": model.raymap_vae}
-    conditioning = encode_known(images, known, rays, torch.ones_like(known), **vaes, views_at_once=_CHUNK, transformer=model.dit.config)
+    conditioning = encode_known(
+        images,
+        known,
+        rays,
+        torch.ones_like(known),
+        image_vae=model.image_vae,
+        raymap_vae=model.raymap_vae,
+        views_at_once=_CHUNK,
+        transformer=model.dit.config,
+    )
     facts = stacked_facts([conditioning], model.dit.config)
     data = unsplit(encode_in_chunks(model.image_vae, images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
     noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed)).to(data)
