@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_STEPS, MOST_VIEWS, require_between
+from fb_core.networks.precision import Precision
 from fb_core.sampling.options import Guess, SamplingConfig
 
 
@@ -98,6 +99,8 @@ class CompletionConfig:
     guess: Guess | None = None
     """How the render enters (``start`` render): as the `start` of the sampling at `strength`, `told` to the model as a guess, or `both`;
     None is what the model's folder recommends (start where it says nothing). Only models that were trained with guesses understand them."""
+    precision: Precision = "auto"
+    """Of the model's matrix products: auto is bfloat16 where the machine is faster at it, else that of the weights (float32)."""
     window: int | None = None
     """Views denoised together, averaged over random windows, for sequences longer than the model likes; None is all of them."""
     memory_budget: float | None = None
@@ -163,7 +166,7 @@ class CompletionConfig:
         """How to sample: these options where they are given, the model's recommendation elsewhere."""
         given = {
             name: getattr(self, name)
-            for name in ("steps", "guidance_unknown", "guidance_known", "window", "guess")
+            for name in ("steps", "guidance_unknown", "guidance_known", "window", "guess", "precision")
             if getattr(self, name) is not None
         }
         if self.memory_budget is not None:

@@ -20,6 +20,7 @@ from fb_core.data.captures import Frame
 from fb_core.files.whole import remove_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
+from fb_core.networks.precision import in_words
 from fb_nerfstudio.bank import Bank, without_requested
 from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
 from fb_nerfstudio.captured_views import CapturedViewsDatamanager
@@ -211,6 +212,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             with refusing():
                 told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
             CONSOLE.print(told)
+            if config.inpainter == "diffusion":
+                CONSOLE.print(f"The model's matrix products: {in_words(config.precision, self.device)}.")
             context = LazyViews(lambda index: self.captured_view(index, cameras[index]), plan.context)
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))
             with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():

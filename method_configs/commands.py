@@ -166,6 +166,7 @@ def complete(
     prompt: str | None = None,
     text_encoder: Path | None = None,
     device: str | None = None,
+    precision: Literal["auto", "float32", "bfloat16"] = "auto",
     fps: float = 8.0,
     check: bool = True,
     overwrite: bool = False,
@@ -189,6 +190,7 @@ def complete(
         prompt: What is to be seen, for models that read text.
         text_encoder: Folder with the CLIP text model, which prompts need.
         device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
+        precision: Of the model's matrix products (auto: bfloat16 where the machine is faster at it).
         fps: Pictures per second of the film.
         check: Look for the cameras of photos and new views once more, and report how far they are off (self-consistency).
         overwrite: Replace an earlier output there.
@@ -211,6 +213,7 @@ def complete(
         prompt=prompt,
         text_encoder=text_encoder,
         device=device,
+        precision=precision,
         fps=fps,
         check=check,
     )

@@ -11,6 +11,7 @@ from fb_core.fly_through import Passes, plan_passes, room_beside
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.model_registration import ROUNDS
+from fb_core.networks.precision import Precision
 
 CHECKED = 8
 """Photos, and new views, that the self-consistency is measured on."""
@@ -50,6 +51,8 @@ class CompleteOptions:
     """Folder of the CLIP text model, for prompts."""
     device: str | None = None
     """Where to compute; None is a GPU if there is one."""
+    precision: Precision = "auto"
+    """Of the model's matrix products while views are generated; auto is bfloat16 where the device is faster at it."""
     fps: float = 8.0
     """Pictures per second of the film."""
     check: bool = True
@@ -94,7 +97,7 @@ class Plan:
     def of(photos: int, views: int, model: Fillerbuster, options: CompleteOptions) -> Plan:
         """For so many photos with a camera and views along the path. Raises ValueError when memory does not suffice for one view."""
         photos, side = min(photos, options.photos), options.size or model.size
-        sampling = model.recommended_sampling
+        sampling = dataclasses.replace(model.recommended_sampling, precision=options.precision)
         sampling = sampling if options.steps is None else dataclasses.replace(sampling, steps=options.steps)
         room = room_beside(photos, model, sequence=options.sequence, views=views, side=side, sampling=sampling, prompt=options.prompt)
         return Plan(photos=photos, side=side, sampling=sampling, passes=plan_passes(views, room=room))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
 from fb_core.networks.dit import DiT
+from fb_core.networks.precision import resolved
 from fb_core.networks.prepared import Prepared
 from fb_core.sampling.guidance import branches, guidance_map, guided
 from fb_core.sampling.options import SamplingConfig
@@ -59,7 +60,11 @@ class Denoising:
     ) -> Float[Tensor, "n 32 h w"]:
         """Latents at t = 0."""
         solver = "euler" if self.sampling.reference_compatible else self.sampling.solver
-        return integrate(self.field(), self.start(), self.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume)
+        half = resolved(self.sampling.precision, self.noise.device) == torch.bfloat16
+        with torch.autocast(self.noise.device.type, torch.bfloat16, enabled=half):
+            return integrate(
+                self.field(), self.start(), self.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume
+            )
 
     @property
     def times(self) -> list[float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from fb_core.limits import MOST_SAMPLING_STEPS, is_finite, require_between
+from fb_core.networks.precision import PRECISIONS, Precision
 from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.sampling.solvers import SOLVERS
 from fb_core.sampling.time_grids import time_grid
@@ -46,6 +47,9 @@ class SamplingConfig:
     that were trained to be told guesses; or 'both'."""
     belief: float = 0.7
     """How far a guess that is told is to be believed, 0 to 1 (see `fb_core.training.guesses` for what models learn)."""
+    precision: Precision = "float32"
+    """Of the transformer's matrix products: 'float32' for those of the weights, 'bfloat16', or 'auto', bfloat16 where the device is
+    faster at it. The sampler's state, norms and guidance stay in float32."""
     known: str = "guided"
     """How known content enters: 'guided' by conditioning and guidance alone (paper), or 'imposed', re-imposed on wholly known latents."""
     window: int | None = None
@@ -66,6 +70,8 @@ class SamplingConfig:
         time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {', '.join(SOLVERS)}, got {self.solver!r}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision!r}")
         if self.guess not in get_args(Guess):
             raise ValueError(f"guess: expected one of {', '.join(get_args(Guess))}, got {self.guess!r}")
         if not 0 < self.belief < 1:
@@ -89,8 +95,11 @@ class SamplingConfig:
         return time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
 
     def for_poses(self) -> SamplingConfig:
-        """The budget of recovering raymaps: few steps suffice (docs/speed_and_accuracy.md), in windows of 8 views as in the paper."""
-        return dataclasses.replace(self, steps=min(self.steps, POSE_STEPS), window=self.window or POSE_WINDOW)
+        """The budget of recovering raymaps: few steps suffice (docs/speed_and_accuracy.md), in windows of 8 views as in the paper.
+
+        In the precision of the weights: what rounding does to colours nobody sees, what it does to rays moves cameras.
+        """
+        return dataclasses.replace(self, steps=min(self.steps, POSE_STEPS), window=self.window or POSE_WINDOW, precision="float32")
 
     @staticmethod
     def from_dict(options: Mapping[str, Any]) -> SamplingConfig:
