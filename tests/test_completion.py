@@ -147,7 +147,7 @@ def test_rounds_see_the_context_and_the_anchors_and_only_the_new_views_come_back
     for asked in model.asked[1:]:
         assert bool((asked.image_known[:9] == 1).all()) and bool((asked.image_known[9:] == 0).all())
         assert torch.allclose(asked.images[4:9], rounds[0].images.permute(0, 3, 1, 2) / 255.0)
-    assert model.sampling[0] == SamplingConfig(steps=2, guidance_unknown=7.0, guidance_known=1.1)
+    assert model.sampling[0] == SamplingConfig(steps=2, guidance_unknown=7.0, guidance_known=1.1, precision="auto")
     assert {origin.role for origin in rounds[0].origins} == {"anchor"} and rounds[2].rounds == [2]
     assert all(origin.model_hash == model.model_hash for origin in rounds[1].origins)
 
@@ -269,7 +269,7 @@ def test_nonsense_options_are_refused(option: str, value):
 
 def test_options_that_are_not_given_come_from_the_model():
     recommended = SamplingConfig(steps=9, guidance_unknown=1.5, guidance_known=1.0, solver="euler")
-    assert CompletionConfig().sampling(recommended) == recommended
+    assert CompletionConfig().sampling(recommended) == dataclasses.replace(recommended, precision="auto")
     given = CompletionConfig(steps=5, guidance_unknown=3.0).sampling(recommended)
     assert (given.steps, given.guidance_unknown, given.guidance_known, given.solver) == (5, 3.0, 1.0, "euler")
 
