@@ -137,7 +137,7 @@ def mean_of(samples: int) -> str:
 def evaluate_completion(
     model: Fillerbuster,
     task: CompletionTask,
-    sampling: SamplingConfig = SamplingConfig(),
+    sampling: SamplingConfig | None = None,
     *,
     strengths: Sequence[float] = (),
     samples: int = 1,
@@ -145,8 +145,9 @@ def evaluate_completion(
 ) -> Iterable[RoomResult]:
     """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result.
 
-    With several ``samples`` their mean is scored, too.
+    With several ``samples`` their mean is scored, too. ``sampling`` None is what the model's folder recommends.
     """
+    sampling = model.recommended_sampling if sampling is None else sampling
     averaged = (mean_of(samples),) if samples > 1 else ()
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from fb_core.conditioning import LATENT_CHANNELS, Conditioning, split, unsplit
 from fb_core.flow import at_time
+from fb_core.sampling.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.solvers import VelocityField
 from fb_core.sampling.time_grids import reference_grid
 
@@ -50,11 +51,12 @@ def imposed(
     """The field with the straight way from the noise to the known latents where the mask is 1, as long as the time is above ``until``.
 
     Every solver goes straight ways without error, so at each time the network sees the known latents with just the noise of that time.
+    There the velocity jumps: latents that went straight join the others.
     """
     straight = noise - known
 
-    def field_with_known(state: Tensor, time: float) -> Tensor:
-        velocity = field(state, time)
-        return straight.where(mask > 0, velocity) if time > until else velocity
+    def piece(since: float) -> VelocityField:
+        inner = piece_of(field, since)
+        return inner if since <= until else lambda state, time: straight.where(mask > 0, inner(state, time))
 
-    return field_with_known
+    return Jumping(jumps=(*jumps_of(field), until), piece=piece)
