@@ -42,9 +42,9 @@ def known_latents(image_known: Float[Tensor, "n 1 h w"], rays_known: Float[Tenso
 
 def imposed(
     field: VelocityField,
-    known: Float[Tensor, "n 32 h w"],
-    noise: Float[Tensor, "n 32 h w"],
-    mask: Float[Tensor, "n 32 h w"],
+    known: Float[Tensor, "n *rest"],
+    noise: Float[Tensor, "n *rest"],
+    mask: Float[Tensor, "n *rest"],
     *,
     until: float = -1.0,
 ) -> VelocityField:
