@@ -33,7 +33,7 @@ def straight_where_told(field):
     return lambda state, time: (START - TOLD).where(COUNTS > 0, field(state, time))
 
 
-def by_hand(legs, start: Tensor = START, *, steps: int = 400) -> Tensor:
+def by_hand(legs, start: Tensor = START, *, steps: int = 60) -> Tensor:
     """Legs (field, begin, end) one after the other, by the classical Runge-Kutta method in a time of their own that goes from 1 to 0."""
     for field, begin, end in legs:
 
@@ -49,7 +49,7 @@ def error(got: Tensor, wanted: Tensor) -> float:
 
 
 def order_of(solver: str, field, wanted: Tensor, **grid) -> float:
-    errors = [error(integrate(field, START, time_grid(steps, **grid), solver=solver), wanted) for steps in (64, 256)]
+    errors = [error(integrate(field, START, time_grid(steps, **grid), solver=solver), wanted) for steps in (32, 128)]
     return math.log(errors[0] / errors[1]) / math.log(4)
 
 
@@ -95,15 +95,14 @@ def test_told_latents_join_in_two_legs_to_the_bit(solver, strength, steps):
     assert torch.equal(joined, integrate(flow(), middle, lower, solver=solver))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("strength", [0.3, 0.5, 0.77])
-@pytest.mark.parametrize("guidance", [1.0, 7.0])
-def test_every_solver_keeps_its_order_over_the_join(solver, strength, guidance):
+@pytest.mark.parametrize(("strength", "guidance"), [(0.3, 3.0), (0.5, 1.0), (0.77, 7.0)])
+def test_every_solver_keeps_its_order_over_the_join(strength, guidance):
     free = flow(guidance)
     wanted = by_hand([(straight_where_told(free), 1.0, strength), (free, strength, 0.0)])
     field = imposed(free, TOLD, START, COUNTS, until=strength)
-    assert error(fine_endpoint(field, START, steps=400), wanted) < 1e-7
-    assert order_of(solver, field, wanted, shift=2.0, through=[strength]) > ORDERS[solver] - 0.3
+    assert error(fine_endpoint(field, START, steps=120), wanted) < 1e-5
+    for solver, order in ORDERS.items():
+        assert order_of(solver, field, wanted, shift=2.0, through=[strength]) > order - 0.3, solver
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -169,23 +168,23 @@ def test_after_standing_still_every_solver_sets_out_as_from_a_start(solver, shar
     assert torch.equal(integrate(field, NOISE, elsewhere, solver=solver), integrate(plain, NOISE, moving, solver=solver))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_every_solver_keeps_its_order_after_standing_still(solver):
+def test_every_solver_keeps_its_order_after_standing_still():
     variant = GuidanceVariant(zero_init=0.07)
     wanted, field = by_hand([(flow(), 0.93, 0.0)]), flow(variant=variant)
-    assert error(fine_endpoint(field, START, steps=400), wanted) < 1e-6
-    assert order_of(solver, field, wanted, shift=2.0, through=variant.jumps) > ORDERS[solver] - 0.3
+    assert error(fine_endpoint(field, START, steps=120), wanted) < 1e-5
+    for solver, order in ORDERS.items():
+        assert order_of(solver, field, wanted, shift=2.0, through=variant.jumps) > order - 0.3, solver
 
 
 # Intervals ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("variant", INTERVALS)
-def test_every_solver_keeps_its_order_where_guidance_sets_in_and_ends(solver, variant):
+def test_every_solver_keeps_its_order_where_guidance_sets_in_and_ends(variant):
     legs = [(flow(1.0), 1.0, variant.begin), (flow(), variant.begin, variant.end), (flow(1.0), variant.end, 0.0)]
     wanted, field = by_hand([leg for leg in legs if leg[1] > leg[2]]), flow(variant=variant)
-    assert order_of(solver, field, wanted, shift=2.0, through=variant.jumps) > ORDERS[solver] - 0.3
+    for solver, order in ORDERS.items():
+        assert order_of(solver, field, wanted, shift=2.0, through=variant.jumps) > order - 0.3, solver
     assert SamplingConfig(guidance=variant).times == time_grid(24, shift=2.0, through=variant.jumps)
 
 
@@ -205,7 +204,7 @@ def test_pieces_of_all_kinds_meet_in_one_sampling():
     still = straight_where_told(lambda state, time: torch.zeros_like(state))
     legs = [(still, 1.0, 0.9), (straight_where_told(flow(1.0)), 0.9, 0.8), (straight_where_told(flow()), 0.8, 0.5)]
     wanted = by_hand([*legs, (flow(), 0.5, 0.3), (flow(1.0), 0.3, 0.0)])
-    sampling = SamplingConfig(steps=256, strength=0.5, guidance=variant)
+    sampling = SamplingConfig(steps=128, strength=0.5, guidance=variant)
     for solver in SOLVERS:
         got = integrate(field, START, sampling.times_from_noise_too, solver=solver)
-        assert error(got, wanted) < (0.02 if solver == "euler" else 2e-4), solver
+        assert error(got, wanted) < (0.03 if solver == "euler" else 1e-3), solver

@@ -51,7 +51,7 @@ def imposed(
     """The field with the straight way from the noise to the known latents where the mask is 1, as long as the time is above ``until``.
 
     Every solver goes straight ways without error, so at each time the network sees the known latents with just the noise of that time.
-    There the velocity jumps: latents that went straight join the others.
+    At ``until`` the velocity jumps (`Jumping`): latents that went straight join the others. Times should go through it.
     """
     straight = noise - known
 
