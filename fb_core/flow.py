@@ -34,22 +34,30 @@ def logit_normal_times(count: int, *, generator: torch.Generator) -> Float[Tenso
 
 
 def masked_loss(
-    predicted: Float[Tensor, "b n c h w"], target: Float[Tensor, "b n c h w"], weight: Float[Tensor, "b n 1 h w"] | None = None
+    predicted: Float[Tensor, "b n c h w"],
+    target: Float[Tensor, "b n c h w"],
+    weight: Float[Tensor, "b n 1 h w"] | None = None,
+    *,
+    channels: slice = slice(None),
 ) -> Float[Tensor, ""]:
-    """Mean squared error, over the positions with weight (0 where there is no ground truth, such as rays of unposed photos)."""
-    error = (predicted - target).square()
-    if weight is None:
-        return error.mean()
-    return (error * weight).sum() / (weight.expand_as(error).sum()).clamp(min=1e-12)
+    """The loss of training and validation: mean squared error of some channels, 0 at positions of weight 0 (where there is no ground
+    truth, such as rays of unposed photos).
+
+    The mean is over all positions, whatever their weights: so the losses of a batch's equal parts, on one process or on many, average to
+    the whole batch's, and an unposed photo among posed ones does not make their rays count for more.
+    """
+    error = (predicted - target).square()[:, :, channels]
+    return error.mean() if weight is None else (error * weight).mean()
 
 
 @torch.no_grad()
 def validation_loss(network: Network, data: Float[Tensor, "b n 32 h w"], noise: Float[Tensor, "b n 32 h w"], *, steps: int = 20) -> Tensor:
     """VAL of the paper's table 2: velocity error of image and raymap channels at ``steps`` equally spaced times. Shape [steps, 2]."""
     half = data.shape[2] // 2
-    losses = []
+    losses, wanted = [], velocity(data, noise)
     for time in torch.linspace(1.0, 1.0 / steps, steps).tolist():
         batch_time = data.new_full((len(data),), time)
-        error = (network(at_time(data, noise, batch_time), batch_time) - velocity(data, noise)).square()
-        losses.append(torch.stack([error[:, :, :half].mean(), error[:, :, half:].mean()]))
+        predicted = network(at_time(data, noise, batch_time), batch_time)
+        modalities = slice(half), slice(half, None)
+        losses.append(torch.stack([masked_loss(predicted, wanted, channels=channels) for channels in modalities]))
     return torch.stack(losses)

@@ -95,9 +95,10 @@ class Fillerbuster:
         return SamplingConfig.from_dict(self.info.get("sampling", {}))
 
     def estimate(
-        self, views: int, size: tuple[int, int], sampling: SamplingConfig = SamplingConfig(), *, prompt: str | None = None
+        self, views: int, size: tuple[int, int], sampling: SamplingConfig | None = None, *, prompt: str | None = None
     ) -> MemoryEstimate:
         """Memory that `complete` will need for so many views of a size (height, width); see `fb_core.memory.estimate`."""
+        sampling = self.recommended_sampling if sampling is None else sampling
         prompted = bool(prompt) and sampling.guidance_text != 0
         return estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
 
@@ -107,7 +108,7 @@ class Fillerbuster:
         views: Views,
         *,
         generator: torch.Generator,
-        sampling: SamplingConfig = SamplingConfig(),
+        sampling: SamplingConfig | None = None,
         on_step: OnStep | None = None,
         on_progress: Callable[[Progress], None] | None = None,
         prompt: str | None = None,
@@ -119,14 +120,14 @@ class Fillerbuster:
         Args:
             views: 1 or more views with sides of at least 16 pixels (sides that 16 does not divide are padded with unknown pixels).
             generator: decides the sample, on the CPU. Each view's noise depends only on it and on the view's place.
-            sampling: steps, guidance, windows, memory.
+            sampling: steps, guidance, windows, memory; None is `recommended_sampling`.
             on_step: called with (steps done, steps in all).
             on_progress: called after every step with the step, the time reached, and a cheap preview that is made only when asked for.
             prompt: says what is to be seen, for models that read text; None and "" cost nothing.
             current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1,
                 except where `views` knows better. Latents of which they do not know all pixels start from noise; the others join them
-                at the first time that is not above the strength. With `sampling.guess` they are (also) told as a guess: where no pixel is
-                known, theirs are, to be believed as far as `sampling.belief` and their own mask say.
+                at the strength. With `sampling.guess` they are (also) told as a guess: where no pixel is known, theirs are, to be
+                believed as far as `sampling.belief` and their own mask say.
             resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not drawn from.
 
         Raises:
@@ -136,6 +137,7 @@ class Fillerbuster:
                 read, or too little memory however the work is cut (saying what would fit).
         """
         _check(views)
+        sampling = self.recommended_sampling if sampling is None else sampling
         if current is not None:
             _check_current(current, views)
         text = self._text_of(prompt if sampling.guidance_text else None)
@@ -215,9 +217,10 @@ class Fillerbuster:
         _logger.debug("%d views of %dx%d: %.2f GiB, %s", views, size[1], size[0], expected.peak / 2**30, expected.cut)
         return expected.cut
 
-    def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig = SamplingConfig()) -> Denoising:
+    def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig | None = None) -> Denoising:
         """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
         _check(views)
+        sampling = self.recommended_sampling if sampling is None else sampling
         padded = _padded(views.to(self.device))
         cut = self._cut(len(views), views.size, sampling, None)
         return self._denoising(padded, _frame_of(padded), None, None, self._text_of(None), seed, sampling, cut)

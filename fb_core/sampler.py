@@ -6,6 +6,7 @@ map never leaves its views. The ideas live in `fb_core.sampling`, one file each;
 """
 
 from fb_core.sampling.guidance import GuidanceVariant, branches, combined, evaluated_by, guidance_map, guided
+from fb_core.sampling.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.randomness import Orders, given_order, noise_of, random_orders
 from fb_core.sampling.reference import reference_field
@@ -19,6 +20,7 @@ __all__ = [
     "GRIDS",
     "SOLVERS",
     "GuidanceVariant",
+    "Jumping",
     "OnStep",
     "OnTrajectory",
     "Orders",
@@ -37,7 +39,9 @@ __all__ = [
     "guided",
     "imposed",
     "integrate",
+    "jumps_of",
     "noise_of",
+    "piece_of",
     "random_orders",
     "reference_field",
     "reference_grid",

@@ -24,7 +24,7 @@ from fb_core.files.whole import whole_file
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 
-_VERSION = 1
+_VERSION = 2
 """Of the key and of the files. To be raised whenever the same inputs come to give other pictures."""
 _ONLY_HOW = ("memory_budget_bytes", "views_at_once")
 """Sampling options that cut the work without deciding what is generated."""

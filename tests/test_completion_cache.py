@@ -57,7 +57,7 @@ def test_a_key_is_the_same_everywhere():
     views = Views(images=values[:, :3], image_known=ones, raymaps=values, rays_known=ones)
     options = {"seed": 1, "model_hash": "0123456789abcdef"}
     sampling = {name: value for name, value in dataclasses.asdict(SAMPLING).items() if name not in ("memory_budget_bytes", "views_at_once")}
-    told = {"version": 1, "seed": 1, "sampling": sampling, "model": "0123456789abcdef", "prompt": "", "shape": [1, 3, 2, 2]}
+    told = {"version": 2, "seed": 1, "sampling": sampling, "model": "0123456789abcdef", "prompt": "", "shape": [1, 3, 2, 2]}
     parts = [json.dumps(told, sort_keys=True).encode()]
     for numbers in ([1.0] * 4, range(12), [1.0] * 4, range(24)):
         scale = 32 if isinstance(numbers, range) else 1

@@ -43,8 +43,30 @@ def test_loss_ignores_positions_without_ground_truth():
     wrong = velocity(data, noise).clone()
     wrong[:, 1:] += 100
     wrong[:, 0] += 2
-    assert torch.allclose(masked_loss(wrong, velocity(data, noise), weight), torch.tensor(4.0))
+    loss = masked_loss(wrong.requires_grad_(), velocity(data, noise), weight)
+    assert torch.allclose(loss, torch.tensor(4.0 / 3)), "an error of 2 in one view of three; the mean is over all of them"
+    (gradient,) = torch.autograd.grad(loss, wrong)
+    assert not gradient[:, 1:].any() and bool(gradient[:, 0].any())
     assert masked_loss(wrong, data, torch.zeros_like(weight)) == 0
+
+
+def test_losses_of_equal_parts_average_to_the_whole_s_however_uneven_their_ground_truth():
+    (data, noise), weight = pair(), torch.zeros(2, 3, 1, 4, 4)
+    weight[0], weight[1, 0, :, 0] = 1, 1
+    whole, *parts = (masked_loss(data[part], noise[part], weight[part]) for part in (slice(None), slice(0, 1), slice(1, 2)))
+    assert torch.allclose(whole, sum(parts) / 2) and parts[0] > 3 * parts[1]
+    assert torch.allclose(masked_loss(data, noise, torch.ones_like(weight)), masked_loss(data, noise))
+
+
+def test_validation_has_the_same_loss_per_modality():
+    data, noise = pair()
+    wrong = velocity(data, noise).clone()
+    wrong[:, :, :16] += 2
+    wrong[:, :, 16:] += 3
+    losses = validation_loss(lambda state, time: wrong, data, noise, steps=2)
+    assert torch.allclose(losses, torch.tensor([[4.0, 9.0]] * 2))
+    for column, channels in enumerate((slice(16), slice(16, None))):
+        assert torch.equal(losses[0, column], masked_loss(wrong, velocity(data, noise), channels=channels))
 
 
 def test_times_are_logit_normal():

@@ -8,7 +8,7 @@ from tiny_models import tiny_model
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig, noise_of
-from fb_core.sampler import Point
+from fb_core.sampler import SOLVERS, Point, integrate
 from fb_core.views import Views
 
 QUICK = SamplingConfig(steps=2, guidance_unknown=3.0)
@@ -223,7 +223,8 @@ def test_latents_that_count_go_straight_until_the_strength_and_all_others_start_
     started = dataclasses.replace(plain, sampling=dataclasses.replace(sampling, strength=0.4), current=current, counts=counts)
     points = [Point(state=started.start(), time=1.0)]
     started.run(on_trajectory=lambda at: points.append(at.point))
-    assert torch.equal(points[0].state, plain.noise) and [point.time for point in points] == sampling.times
+    assert torch.equal(points[0].state, plain.noise) and [point.time for point in points] == started.times
+    assert 0.4 in started.times and abs(len(started.times) - len(sampling.times)) <= 1, "they join at the strength, in as many steps"
     waiting = [point for point, before in zip(points[1:], points, strict=False) if before.time > 0.4]
     assert len(waiting) >= 3
     for point in waiting:
@@ -231,6 +232,58 @@ def test_latents_that_count_go_straight_until_the_strength_and_all_others_start_
         assert torch.allclose(point.state[3, :, :2], straight[3, :, :2], atol=1e-5)
         assert not torch.allclose(point.state[3, :, 2:], straight[3, :, 2:], atol=1e-2)
     assert not torch.allclose(points[-1].state[3, :, :2], current[3, :, :2], atol=1e-2), "the network has moved it since"
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("options", [{}, {"guidance_unknown": 1.0, "guidance_known": 1.0}, {"known": "imposed"}, {"window": 2}])
+def test_latents_that_join_make_two_legs_that_know_nothing_of_each_other(model, solver, options):
+    """Down to the strength the told latents' straight way beside the plain velocity; from there the times of views that are told wholly."""
+    sampling = SamplingConfig(**{"steps": 7, "guidance_unknown": 3.0, "solver": solver} | options)
+    plain = model.denoising(mixed_views(2, 1, 2), seed=0, sampling=sampling)
+    current, counts = torch.randn(5, 32, 4, 4, generator=seeded(3)), torch.zeros(5, 32, 4, 4)
+    counts[3:, :, :2] = 1
+    later = dataclasses.replace(sampling, strength=0.4)
+    joined = dataclasses.replace(plain, sampling=later, current=current, counts=counts)
+    free, straight, upper = plain.field(), plain.noise - current, [time for time in joined.times if time >= 0.4]
+    middle = integrate(lambda state, time: straight.where(counts > 0, free(state, time)), plain.noise, upper, solver=solver)
+    assert torch.allclose(joined.run(), integrate(free, middle, later.times, solver=solver), atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("stop_at", [3, 4, 5])
+def test_a_completion_interrupted_around_the_join_goes_on_to_the_same_bits(model, solver, stop_at):
+    views, sampling = mixed_views(2, 1, 2), SamplingConfig(steps=6, guidance_unknown=3.0, solver=solver, strength=0.45)
+    times, current, seen = sampling.times_from_noise_too, partly_current(views), []
+    assert times.index(0.45) == 4 and len(times) == 7
+
+    def stop(done, of):
+        seen.append((done, of))
+        if done == stop_at:
+            raise KeyboardInterrupt
+
+    whole = model.complete(views, generator=seeded(), sampling=sampling, current=current)
+    with pytest.raises(KeyboardInterrupt, match=f"stopped after {stop_at} of 6 steps") as stopped:
+        model.complete(views, generator=seeded(), sampling=sampling, current=current, on_step=stop)
+    rest = {"current": current, "resume": stopped.value, "on_step": lambda done, of: seen.append((done, of))}
+    resumed = model.complete(views, generator=seeded(77), sampling=sampling, **rest)
+    assert seen == [(done, 6) for done in range(1, 7)] and torch.equal(resumed.images, whole.images)
+
+
+def test_a_model_s_own_sampling_is_the_default_everywhere(tmp_path):
+    model = tiny_model(tmp_path)
+    own = {"steps": 3, "guidance_unknown": 2.0, "shift": 1.5, "window": 2}
+    model.info["sampling"] = own
+    views, recommended = mixed_views(1, 1, 2), SamplingConfig(**own)
+    by_default, asked, usual = (
+        model.complete(views, generator=seeded(), **options)
+        for options in ({}, {"sampling": recommended}, {"sampling": SamplingConfig(steps=3)})
+    )
+    assert torch.equal(by_default.images, asked.images) and not torch.equal(by_default.images, usual.images)
+    assert model.denoising(views, seed=0).sampling == recommended
+    assert model.estimate(24, (64, 64)) == model.estimate(24, (64, 64), recommended) != model.estimate(24, (64, 64), SamplingConfig())
+    images = torch.rand(3, 3, 32, 32, generator=seeded(2))
+    poses = model.recover_raymaps(images, generator=seeded(), sampling=recommended.for_poses())
+    assert torch.equal(model.recover_raymaps(images, generator=seeded()), poses)
 
 
 def test_bad_current_views_are_refused(model):

@@ -118,6 +118,17 @@ def test_the_loss_does_not_see_what_has_no_ground_truth():
     assert torch.equal(stage.losses(drawn)["loss"], stage.losses(dataclasses.replace(drawn, velocity=changed))["loss"])
 
 
+def test_training_has_the_one_masked_loss():
+    stage = transformer_stage(CaptionedStub())
+    drawn = stage.draw(0, range(2))
+    weight = torch.zeros_like(drawn.velocity[:, :, :1])
+    weight[0, ..., 1:] = 1
+    drawn = dataclasses.replace(drawn, image_weight=weight)
+    losses, error = stage.losses(drawn), (stage.network(drawn.inputs, drawn.times, drawn.text, drawn.index) - drawn.velocity).square()
+    assert torch.allclose(losses["image"], error[0, :, :16, :, 1:].sum() / error[:, :, :16].numel())
+    assert losses["rays"] == 0 and bool(error[:, :, 16:].any()), "pictures without poses have no true rays"
+
+
 def test_losses_of_parts_average_to_the_loss_of_the_batch():
     stage = transformer_stage(CaptionedStub())
     whole, *parts = (float(stage.losses(stage.draw(0, rows))["loss"].detach()) for rows in (range(2), range(0, 2, 2), range(1, 2, 2)))

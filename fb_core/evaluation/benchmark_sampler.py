@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fb_core.conditioning import LATENT_CHANNELS, STATE_CHANNELS
 from fb_core.evaluation.benchmarks import Bar, OnCell, Report
 from fb_core.evaluation.completion import unseen_room
 from fb_core.evaluation.solvable_flows import Mixture, fine_endpoint, guided_flow
@@ -20,6 +21,7 @@ from fb_core.inpainter import Fillerbuster
 from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.solvers import SOLVERS, VelocityField, evaluations
+from fb_core.sampling.starts import imposed
 from fb_core.sampling.time_grids import time_grid
 from fb_core.sampling.trajectory import integrate
 from fb_core.views import Views
@@ -42,6 +44,8 @@ class SamplerBenchmark:
     """Time shifts of the even grid."""
     intervals: tuple[tuple[float, float], ...] = ((0.9, 0.2), (0.8, 0.3))
     """Limited guidance intervals (begin, end)."""
+    strength: float = 0.5
+    """Time at which half of the latents join the others, which start from noise."""
     reference_steps: int = 50
     """Euler steps of the original."""
     fine_steps: int = 1000
@@ -62,6 +66,8 @@ class SamplerBenchmark:
     def __post_init__(self) -> None:
         if min(self.problems, self.views - 1, self.fine_steps, self.reference_steps, *self.steps) < 1 or not self.guidance:
             raise ValueError(f"benchmark: expected at least one problem, step and guidance scale, and two views, got {self}")
+        if not 0 < self.strength < 1:
+            raise ValueError(f"benchmark: expected a strength between 0 and 1, got {self.strength}")
 
 
 QUICK = SamplerBenchmark(
@@ -80,6 +86,9 @@ class _Problem:
     start: Tensor
     exact: Tensor
     guidance: float
+    joined: VelocityField
+    """The velocity when half of the latents are told and join at the strength."""
+    exact_joined: Tensor
 
     def error(self, end: Tensor, exact: Tensor | None = None) -> float:
         """Mean over views of the distance to the exact endpoint over its length."""
@@ -97,7 +106,10 @@ class _Problem:
 def run_sampler(
     config: SamplerBenchmark = SamplerBenchmark(), model: Fillerbuster | None = None, *, on_cell: OnCell = lambda _: None
 ) -> Report:
-    """One row per (flow, guidance, solver, grid, steps), the bars, limited intervals and pose budgets. None is the bundled model."""
+    """One row per (flow, guidance, solver, grid, steps), the bars, starts at the strength, limited intervals and pose budgets.
+
+    ``model`` None is the bundled one.
+    """
     report = Report(seed=config.seed)
     flows: dict[str, Callable[[float, int], _Problem]] = {"solvable flow": lambda scale, number: _solvable(config, scale, number)}
     if config.model:
@@ -118,30 +130,44 @@ def run_sampler(
 
 
 def _solvable(config: SamplerBenchmark, guidance: float, number: int) -> _Problem:
-    """The condition is three of the sixteen components, in 64 dimensions."""
+    """The condition is three of the sixteen components, in 64 dimensions; half of these may be told, from a sample of the condition."""
     generator = torch.Generator().manual_seed(1000 * config.seed + number)
     everything = Mixture.drawn(16, 64, generator=generator)
-    start = torch.randn(16, 64, generator=generator, dtype=torch.float64)
+    condition, start = everything.of(range(3)), torch.randn(16, 64, generator=generator, dtype=torch.float64)
 
     def field(variant: GuidanceVariant = GuidanceVariant()) -> VelocityField:
-        return guided_flow(everything, everything.of(range(3)), guidance, variant)
+        return guided_flow(everything, condition, guidance, variant)
 
-    exact = fine_endpoint(field(), start, steps=config.fine_steps)
-    return _Problem(field=field(), limited=field, start=start, exact=exact, guidance=guidance)
+    component = torch.randint(3, (16,), generator=generator)
+    spread = condition.variances[component].sqrt()
+    told = condition.means[component] + spread * torch.randn(16, 64, generator=generator, dtype=torch.float64)
+    counts = (torch.arange(64) < 32).to(told).expand(16, -1)
+    joined = imposed(field(), told, start, counts, until=config.strength)
+    exact, exact_joined = (fine_endpoint(flow, start, steps=config.fine_steps) for flow in (field(), joined))
+    return _Problem(field=field(), limited=field, start=start, exact=exact, guidance=guidance, joined=joined, exact_joined=exact_joined)
 
 
 def _trained(config: SamplerBenchmark, model: Fillerbuster, guidance: float, number: int) -> _Problem:
-    """An unseen room of which the model knows half of the views; the exact endpoint is Heun's with many steps."""
-    views = _room(config, number)
+    """An unseen room of which the model knows half of the views, and of the others may be told the left halves.
+
+    The exact endpoint is that of many steps.
+    """
+    whole, views = _room(config, number), _room(config, number)
     views.image_known[len(views) // 2 :] = 0
     sampling = SamplingConfig(guidance_unknown=guidance, guidance_known=min(guidance, 1.1))
 
     def field(variant: GuidanceVariant = GuidanceVariant()) -> VelocityField:
         return model.denoising(views, seed=config.seed, sampling=dataclasses.replace(sampling, guidance=variant)).field()
 
-    start = model.denoising(views, seed=config.seed, sampling=sampling).start()
+    plain = model.denoising(views, seed=config.seed, sampling=sampling)
+    start, later = plain.start(), dataclasses.replace(sampling, strength=config.strength)
+    told = model.denoising(whole, seed=config.seed, sampling=sampling).conditioning.channels[:, :STATE_CHANNELS]
+    counts = torch.ones_like(told)
+    counts[len(views) // 2 :, :LATENT_CHANNELS, :, told.shape[-1] // 2 :] = 0
+    joined = dataclasses.replace(plain, sampling=later, current=told, counts=counts).field()
     exact = integrate(field(), start, time_grid(config.fine_steps), solver="ab2")
-    return _Problem(field=field(), limited=field, start=start, exact=exact, guidance=guidance)
+    exact_joined = integrate(joined, start, time_grid(config.fine_steps, through=(config.strength,)), solver="ab2")
+    return _Problem(field=field(), limited=field, start=start, exact=exact, guidance=guidance, joined=joined, exact_joined=exact_joined)
 
 
 def _room(config: SamplerBenchmark, number: int) -> Views:
@@ -193,29 +219,48 @@ def _measure(report: Report, config: SamplerBenchmark, flow: str, problems: list
     if best is not None:
         name = f"{label} the best ({best['solver']}, {best['grid']})"
         report.bars.append(Bar(name=name, value=float(best["passes"]), limit=PASSES_BAR, sense="<="))
+    report.rows.extend(_started_rows(config, flow, problems))
     if guidance != 1:
         report.rows.extend(_limited_rows(config, flow, problems))
 
 
+def _started_rows(config: SamplerBenchmark, flow: str, problems: list[_Problem]) -> Iterator[dict[str, Any]]:
+    """Half of the latents are told and join the others at the strength: how exactly every solver goes on over the join."""
+    for solver in SOLVERS:
+        for steps in config.steps:
+            if solver == "heun" and steps > max(config.steps) // 2:
+                continue
+            times = SamplingConfig(steps=steps, strength=config.strength).times_from_noise_too
+            errors = [p.error(integrate(p.joined, p.start, times, solver=solver), p.exact_joined) for p in problems]
+            yield {
+                "part": f"{flow}: started at strength {config.strength:g}",
+                "guidance": problems[0].guidance,
+                "solver": solver,
+                "steps": steps,
+                "passes": problems[0].passes(solver, times),
+                "error": sum(errors) / len(errors),
+            }
+
+
 def _limited_rows(config: SamplerBenchmark, flow: str, problems: list[_Problem]) -> Iterator[dict[str, Any]]:
     """Guidance on an interval alone leads elsewhere: how far, beside how exactly it gets there."""
-    usual = SamplingConfig()
-    times = time_grid(usual.steps, shift=usual.shift)
     for begin, end in config.intervals:
         variant = GuidanceVariant(begin=begin, end=end)
+        usual = SamplingConfig(guidance=variant)
         own, moved = 0.0, 0.0
         for problem in problems:
             field = problem.limited(variant)
-            there = integrate(field, problem.start, time_grid(min(config.fine_steps, 200)), solver="ab2")
-            own += problem.error(integrate(field, problem.start, times, solver=usual.solver), there) / len(problems)
+            fine = time_grid(min(config.fine_steps, 200), through=variant.jumps)
+            there = integrate(field, problem.start, fine, solver="ab2")
+            own += problem.error(integrate(field, problem.start, usual.times, solver=usual.solver), there) / len(problems)
             moved += problem.error(there) / len(problems)
         yield {
             "part": f"{flow}: guidance on an interval is another distribution",
             "guidance": problems[0].guidance,
             "interval": f"{begin:g} to {end:g}",
             "steps": usual.steps,
-            "passes": problems[0].passes(usual.solver, times, variant),
-            "passes_of_all": problems[0].passes(usual.solver, times),
+            "passes": problems[0].passes(usual.solver, usual.times, variant),
+            "passes_of_all": problems[0].passes(usual.solver, SamplingConfig().times),
             "error_to_its_own_end": own,
             "distance_of_that_end": moved,
         }

@@ -163,7 +163,7 @@ def mean_of(samples: int) -> str:
 def evaluate_completion(
     model: Fillerbuster,
     task: CompletionTask,
-    sampling: SamplingConfig = SamplingConfig(),
+    sampling: SamplingConfig | None = None,
     *,
     strengths: Sequence[float] = (),
     samples: int = 1,
@@ -173,8 +173,9 @@ def evaluate_completion(
     """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result.
 
     With several ``samples`` their mean is scored, too; with ``told`` the model that is told what is carried over, which is then what is
-    shown as completed.
+    shown as completed. ``sampling`` None is what the model's folder recommends.
     """
+    sampling = model.recommended_sampling if sampling is None else sampling
     averaged = (mean_of(samples),) if samples > 1 else ()
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.sampling.guidance import GuidanceVariant
+from fb_core.sampling.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.solvers import VelocityField
 
 
@@ -51,14 +54,19 @@ class Mixture:
 def guided_flow(everything: Mixture, condition: Mixture, guidance: float, variant: GuidanceVariant = GuidanceVariant()) -> VelocityField:
     """Classifier-free guidance between two laws."""
 
-    def field(state: Tensor, time: float) -> Tensor:
-        conditional = condition.velocity(state, time)
-        if guidance == 1 or not variant.acts_at(time):
-            return conditional
-        null = everything.velocity(state, time)
-        return null + guidance * (conditional - null)
+    def piece(since: float) -> VelocityField:
+        if variant.stands_still_at(since):
+            return lambda state, time: torch.zeros_like(state)
+        if guidance == 1 or not variant.acts_at(since):
+            return condition.velocity
 
-    return field
+        def field(state: Tensor, time: float) -> Tensor:
+            conditional, null = condition.velocity(state, time), everything.velocity(state, time)
+            return null + guidance * (conditional - null)
+
+        return field
+
+    return Jumping(jumps=variant.jumps, piece=piece)
 
 
 def gaussian_endpoint(
@@ -73,13 +81,20 @@ def gaussian_endpoint(
 
 
 def fine_endpoint(field: VelocityField, start: Float[Tensor, "n d"], *, steps: int) -> Float[Tensor, "n d"]:
-    """The endpoint by the classical fourth-order Runge-Kutta method with even steps."""
-    state, step = start, -1.0 / steps
+    """The endpoint by the classical fourth-order Runge-Kutta method with even steps, anew from every jump of the velocity."""
+    state, ends = start, sorted({jump for jump in jumps_of(field) if 0 < jump < 1}, reverse=True)
+    for begin, end in itertools.pairwise([1.0, *ends, 0.0]):
+        state = _runge_kutta(piece_of(field, begin), state, begin, end, steps=math.ceil(steps * (begin - end)))
+    return state
+
+
+def _runge_kutta(field: VelocityField, state: Tensor, begin: float, end: float, *, steps: int) -> Tensor:
+    step = -(begin - end) / steps
     for number in range(steps):
-        time = 1.0 + number * step
+        time = begin + number * step
         first = field(state, time)
         second = field(state + step / 2 * first, time + step / 2)
         third = field(state + step / 2 * second, time + step / 2)
-        fourth = field(state + step * third, max(time + step, 0.0))
+        fourth = field(state + step * third, max(time + step, end))
         state = state + step / 6 * (first + 2 * second + 2 * third + fourth)
     return state

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -68,8 +67,8 @@ class Denoising:
 
     @property
     def times(self) -> list[float]:
-        """The times of the sampling: from 1 where anything starts from noise."""
-        return dataclasses.replace(self.sampling, strength=1.0).times if self._from_noise_too else self.sampling.times
+        """The times of the sampling: from 1 where anything starts from noise, and then through the strength."""
+        return self.sampling.times_from_noise_too if self._from_noise_too else self.sampling.times
 
     @property
     def _from_noise_too(self) -> bool:

@@ -6,6 +6,7 @@ conditional with a prompt. All is combined in float32, because a scale of 7 ampl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import LATENT_CHANNELS, Conditioning, join, split, unsplit
+from fb_core.sampling.jumps import Jumping
 from fb_core.sampling.solvers import VelocityField
 from fb_core.sampling.tiling import Predict
 
@@ -47,10 +49,22 @@ class GuidanceVariant:
         """Whether guidance acts at a time."""
         return self.end <= time <= self.begin
 
+    def stands_still_at(self, time: float) -> bool:
+        """Whether the state does not move yet."""
+        return time > 1 - self.zero_init
+
     @property
     def is_limited(self) -> bool:
         """Whether there are times without guidance."""
         return self.begin < 1 or self.end > 0
+
+    @property
+    def jumps(self) -> tuple[float, ...]:
+        """Times in (0, 1) at which the velocity jumps on the way from noise to data, each the first of what follows.
+
+        At `end` itself guidance acts, so what follows begins at the next smaller number.
+        """
+        return tuple(time for time in (1 - self.zero_init, self.begin, math.nextafter(self.end, 0)) if 0 < time < 1)
 
 
 PLAIN = GuidanceVariant()
@@ -99,14 +113,18 @@ def guided(
             None evaluates `predict` and ignores its null branch.
     """
 
-    def field(state: Tensor, time: float) -> Tensor:
-        if variant.zero_init > 0 and time > 1 - variant.zero_init:
-            return torch.zeros_like(state)
-        acts = variant.acts_at(time)
-        velocities = (predict if acts or unguided is None else unguided)(state, time, None).float()
-        return combined(velocities, scale, text_scale=text_scale, variant=variant, acts=acts)
+    def piece(since: float) -> VelocityField:
+        if variant.stands_still_at(since):
+            return lambda state, time: torch.zeros_like(state)
+        acts = variant.acts_at(since)
+        evaluated = predict if acts or unguided is None else unguided
 
-    return field
+        def field(state: Tensor, time: float) -> Tensor:
+            return combined(evaluated(state, time, None).float(), scale, text_scale=text_scale, variant=variant, acts=acts)
+
+        return field
+
+    return Jumping(jumps=variant.jumps, piece=piece)
 
 
 def combined(

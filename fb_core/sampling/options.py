@@ -89,10 +89,19 @@ class SamplingConfig:
 
     @property
     def times(self) -> list[float]:
-        """The times of a sampling, from where it starts to 0."""
+        """The times of a sampling, from where it starts to 0, through those at which guidance makes the velocity jump."""
+        return self._times(start=self.strength)
+
+    @property
+    def times_from_noise_too(self) -> list[float]:
+        """The times of a sampling in which some latents start from noise at 1 and all others join them at the strength: from there on
+        those of `times`."""
+        return self._times(through=(self.strength,))
+
+    def _times(self, *, start: float = 1.0, through: tuple[float, ...] = ()) -> list[float]:
         if self.reference_compatible:
             return time_grid(self.steps, grid="reference")
-        return time_grid(self.steps, shift=self.shift, grid=self.grid, start=self.strength)
+        return time_grid(self.steps, shift=self.shift, grid=self.grid, start=start, through=(*self.guidance.jumps, *through))
 
     def for_poses(self) -> SamplingConfig:
         """The budget of recovering raymaps: few steps suffice (docs/speed_and_accuracy.md), in windows of 8 views as in the paper.

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from fb_core.conditioning import LATENT_CHANNELS, Conditioning, split, unsplit
 from fb_core.flow import at_time
+from fb_core.sampling.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.solvers import VelocityField
 from fb_core.sampling.time_grids import reference_grid
 
@@ -41,20 +42,21 @@ def known_latents(image_known: Float[Tensor, "n 1 h w"], rays_known: Float[Tenso
 
 def imposed(
     field: VelocityField,
-    known: Float[Tensor, "n 32 h w"],
-    noise: Float[Tensor, "n 32 h w"],
-    mask: Float[Tensor, "n 32 h w"],
+    known: Float[Tensor, "n *rest"],
+    noise: Float[Tensor, "n *rest"],
+    mask: Float[Tensor, "n *rest"],
     *,
     until: float = -1.0,
 ) -> VelocityField:
     """The field with the straight way from the noise to the known latents where the mask is 1, as long as the time is above ``until``.
 
     Every solver goes straight ways without error, so at each time the network sees the known latents with just the noise of that time.
+    At ``until`` the velocity jumps (`Jumping`): latents that went straight join the others. Times should go through it.
     """
     straight = noise - known
 
-    def field_with_known(state: Tensor, time: float) -> Tensor:
-        velocity = field(state, time)
-        return straight.where(mask > 0, velocity) if time > until else velocity
+    def piece(since: float) -> VelocityField:
+        inner = piece_of(field, since)
+        return inner if since <= until else lambda state, time: straight.where(mask > 0, inner(state, time))
 
-    return field_with_known
+    return Jumping(jumps=(*jumps_of(field), until), piece=piece)

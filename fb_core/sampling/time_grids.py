@@ -5,7 +5,9 @@ The best grid depends on the flow (docs/speed_and_accuracy.md), so it is an opti
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterable
 
 from fb_core.limits import MOST_SAMPLING_STEPS, require_between
 
@@ -14,8 +16,8 @@ REFERENCE_LAST = 0.001
 """The original's smallest time before 0."""
 
 
-def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: float = 1.0) -> list[float]:
-    """Times from `start` to 0: ``steps + 1`` of them from 1, fewer from a later start.
+def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: float = 1.0, through: Iterable[float] = ()) -> list[float]:
+    """Times from `start` to 0: ``steps + 1`` of them from 1, fewer from a later start, about as many through further times.
 
     Args:
         steps: steps of the whole way from 1 to 0.
@@ -23,6 +25,8 @@ def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: floa
         grid: "even" is uniform before the shift; "reference" is the original's, evenly from 1 to 0.001 and then 0, whose last step
             is worth almost nothing.
         start: where sampling starts, for SDEdit; the steps below it keep their places.
+        through: times that must be among them, such as those where the velocity jumps; from the last of them on the times are those
+            of a sampling that starts there. What is not between `start` and 0 does not count.
 
     Raises ValueError for no steps, a shift that is not positive, an unknown grid and a start outside (0, 1].
     """
@@ -34,7 +38,11 @@ def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: floa
     if not 0 < start <= 1:
         raise ValueError(f"start: expected a time above 0 and at most 1, got {start}")
     whole = reference_grid(steps) if grid == "reference" else [1.0 - k / steps for k in range(steps + 1)]
-    return _from(start, [shift * t / (1.0 + (shift - 1.0) * t) for t in whole])
+    times = [shift * t / (1.0 + (shift - 1.0) * t) for t in whole]
+    way, ends = [], sorted({time for time in through if 0 < time < start}, reverse=True)
+    for begin, end in itertools.pairwise([start, *ends, 0.0]):
+        way += _before(end, _from(begin, times))
+    return [*way, 0.0]
 
 
 def reference_grid(steps: int) -> list[float]:
@@ -53,3 +61,11 @@ def _from(start: float, times: list[float]) -> list[float]:
     if len(later) > 1 and start - later[0] < (later[0] - later[1]) / 2:
         later = later[1:]
     return [start, *later]
+
+
+def _before(end: float, times: list[float]) -> list[float]:
+    """The times above `end`. The last step is no sliver where `end` was put in: it would cost an evaluation for next to nothing."""
+    earlier = [time for time in times if time > end]
+    if end not in times and len(earlier) > 1 and earlier[-1] - end < (earlier[-2] - earlier[-1]) / 2:
+        earlier = earlier[:-1]
+    return earlier

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.sampling.jumps import piece_of, without_other_pieces
 from fb_core.sampling.solvers import SOLVERS, Point, VelocityField
 
 OnStep = Callable[[int, int], None]
@@ -58,7 +59,7 @@ def integrate(
     """Follow dz/dt = field(z, t) along ``times`` (descending), in float32 at least.
 
     Args:
-        field: the velocity.
+        field: the velocity. Where it jumps (`Jumping`) the solver starts anew; times that hold all jumps keep the solver's order.
         state: where it starts, at the first of the times.
         times: see `time_grid`.
         solver: one of `SOLVERS`.
@@ -76,7 +77,8 @@ def integrate(
     trajectory = resume or Trajectory(point=Point(state=state, time=times[0]), step=0, times=times)
     try:
         while trajectory.step < trajectory.steps:
-            point = SOLVERS[solver](field, trajectory.point, times[trajectory.step + 1])
+            start = without_other_pieces(trajectory.point, field)
+            point = SOLVERS[solver](piece_of(field, start.time), start, times[trajectory.step + 1])
             trajectory = Trajectory(point=point, step=trajectory.step + 1, times=times)
             if on_step is not None:
                 on_step(trajectory.step, trajectory.steps)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fb_core.conditioning import FACTOR, Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit, with_guess
 from fb_core.data.training_task import Sequences, Source, TaskConfig
-from fb_core.flow import at_time, logit_normal_times, velocity
+from fb_core.flow import at_time, logit_normal_times, masked_loss, velocity
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.masks import to_latent_grid
 from fb_core.networks.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
@@ -210,16 +210,10 @@ class DiTStage(Stage):
         """Velocity errors of both modalities and their weighted sum."""
         predicted = self.network(drawn.inputs, drawn.times, drawn.text, drawn.index, drawn.facts)
         image_error, ray_error = (
-            _mean_error(got, wanted, weight)
+            masked_loss(got, wanted, weight)
             for got, wanted, weight in zip(split(predicted), split(drawn.velocity), (drawn.image_weight, drawn.rays_weight), strict=True)
         )
         return {"loss": image_error + self.config.ray_weight * ray_error, "image": image_error, "rays": ray_error}
-
-
-def _mean_error(predicted: Tensor, wanted: Tensor, weight: Tensor | None) -> Float[Tensor, ""]:
-    """Mean squared error, 0 where there is no ground truth. The mean is over all positions: so parts of a batch add up to the whole."""
-    error = (predicted - wanted).square()
-    return error.mean() if weight is None else (error * weight).mean()
 
 
 def _latent_weight(truth: Float[Tensor, "b n 1 h w"] | None) -> Float[Tensor, "b n 1 lh lw"] | None:
