@@ -145,8 +145,8 @@ class Fillerbuster:
         seed = None if resume is None else resume.seed
         seed = int(torch.randint(0, 2**62, (), generator=generator)) if seed is None else seed
         height, width = views.size
-        padded = _padded(views.to(self.device))
-        frame = _frame_of(padded)
+        placed = views.to(self.device)
+        padded, frame = _padded(placed), _frame_of(placed)
         started = counts = guess = None
         if current is not None:
             current = _padded(current.to(self.device), mode="replicate")
@@ -223,7 +223,7 @@ class Fillerbuster:
         sampling = self.recommended_sampling if sampling is None else sampling
         padded = _padded(views.to(self.device))
         cut = self._cut(len(views), views.size, sampling, None)
-        return self._denoising(padded, _frame_of(padded), None, None, self._text_of(None), seed, sampling, cut)
+        return self._denoising(padded, _frame_of(views.to(self.device)), None, None, self._text_of(None), seed, sampling, cut)
 
     def _denoising(
         self,
@@ -338,14 +338,15 @@ def _padded(views: Views, *, mode: str = "constant") -> Views:
 
 
 def _frame_of(views: Views) -> CanonicalFrame | None:
-    """The canonical frame of the posed views, upright in the first of them; None when no view has all of its rays."""
-    posed = (views.rays_known > 0).flatten(1).float().mean(dim=1) >= 0.5
+    """The canonical frame of the posed views, upright in the first of them; None when no view has half of its rays.
+
+    Views as they are given, not padded: what is unknown, padding included, decides nothing.
+    """
+    known = views.rays_known > 0
+    posed = known.flatten(1).float().mean(dim=1) >= 0.5
     if not bool(posed.any()):
         return None
-    rows = (views.rays_known > 0)[posed][0, 0]
-    last_row, last_column = int(rows.any(dim=1).nonzero().max()), int(rows.any(dim=0).nonzero().max())
-    corner = views.raymaps[posed][..., : last_row + 1, : last_column + 1]
-    return CanonicalFrame.of_raymaps(corner)
+    return CanonicalFrame.of_raymaps(views.raymaps[posed], known=views.rays_known[posed])
 
 
 __all__ = ["BUNDLED_MODEL", "LATENT_CHANNELS", "Fillerbuster", "SamplingConfig", "noise_of"]

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.distances import distances_between
 from fb_core.geometry.paths import seen_by, up_of
 from fb_core.geometry.shell import Shell, intersect
 
@@ -62,5 +63,6 @@ def _nearness(cameras: Sequence[Pinholes], targets: Pinholes) -> Float[Tensor, "
     """From 1 for a captured camera in the place and direction of a target towards 0 far away."""
     poses = torch.cat([camera.camera_to_world for camera in cameras])
     extent = float((poses[:, :, 3] - poses[:, :, 3].mean(dim=0)).norm(dim=1).max())
-    away = torch.cdist(poses[:, :, 3], targets.centers) / max(extent, 1e-9) + torch.cdist(poses[:, :, 2], targets.camera_to_world[:, :, 2])
+    away = distances_between(poses[:, :, 3], targets.centers) / max(extent, 1e-9)
+    away = away + distances_between(poses[:, :, 2], targets.camera_to_world[:, :, 2])
     return (1 / (1 + away.min(dim=1).values)).double()

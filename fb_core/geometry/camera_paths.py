@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.distances import rounding_of
 from fb_core.geometry.paths import CaptureShape
 
 PATHS = ("ellipse", "orbit", "spiral")
@@ -27,6 +28,7 @@ _FLATTEST = 0.25  # least ratio of an ellipse's axes: along a straight walk, the
 _LARGEST = 1.5  # semi axes of a fitted ellipse beyond so many extents of the cameras are an extrapolation
 _ONE_WAY = 0.75  # length of the mean look direction from which all cameras look one way (1: exactly)
 _AHEAD = 4.0  # how many radii ahead cameras look that all look one way and meet nowhere
+_ONE_PLACE = 1e-9  # scene units; places that differ by less are one
 _SPIRAL_TURNS, _SPIRAL_RISE = 2, 0.2  # windings; least half height in radii
 
 
@@ -57,7 +59,7 @@ class Ellipse:
         middle = places.mean(dim=0)
         _, spread, axes = torch.linalg.svd(places - middle, full_matrices=True)
         deviation = F.pad(spread, (0, 3 - len(spread))) / math.sqrt(len(places))
-        if float(deviation[0]) <= 1e-6 * (1.0 + float(places.abs().max())):
+        if float(deviation[0]) <= max(_ONE_PLACE, rounding_of(centers)):
             nothing = torch.zeros_like(middle)
             return Ellipse(center=middle.to(centers), first=nothing.to(centers), second=nothing.to(centers))
         along = axes[0]
@@ -154,7 +156,8 @@ def _outward(
     along = _level_across(up, up.roll(1))
     around = angles.cos()[:, None] * along + angles.sin()[:, None] * torch.linalg.cross(up, along)
     there = level.norm(dim=1, keepdim=True)
-    return torch.where(there > 1e-4 * (1 + center.norm()), level / there.clamp(min=1e-12), around)
+    least = max(_ONE_PLACE, 1e-4 * float(there.max()), rounding_of(places))
+    return torch.where(there > least, level / there.clamp(min=1e-12), around)
 
 
 def _kept_apart(targets: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"], shape: CaptureShape) -> Float[Tensor, "n 3"]:

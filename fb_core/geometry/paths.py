@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.distances import distances_between
 from fb_core.geometry.shell import Shell
 
 _CONVERGING = 0.06  # mean squared sine between axes (about 14 degrees): below, the axes are too parallel to meet anywhere
@@ -122,13 +123,13 @@ def kept_clear(
     """
     if len(centers) == 0:
         return centers
-    home = refuges[torch.cdist(centers, refuges).argmin(dim=1)]
+    home = refuges[distances_between(centers, refuges).argmin(dim=1)]
     result, settled = home.clone(), torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
     for eighth in range(8):
         place = centers + (home - centers) * (eighth / 8)
         clear = shell.contains(place, margin=0.9)
         if len(points):
-            clear &= torch.cdist(place, points).min(dim=1).values >= clearance
+            clear &= distances_between(place, points).min(dim=1).values >= clearance
         chosen = clear & ~settled
         result[chosen] = place[chosen]
         settled |= clear

@@ -16,6 +16,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from fb_core.geometry.distances import distances_between
+
 _NEIGHBOURS = 6  # photos that each photo is matched with
 _EPIPOLAR_DEGREES = 0.25  # a match lies this near the plane through both centres and the other ray
 _RATIO = 0.85  # Lowe's ratio, looser than usual because few candidates lie near an epipolar line
@@ -159,7 +161,7 @@ def _pairs(photos: Sequence[Features]) -> list[tuple[int, int]]:
     """Each photo with those that look most the same way from another place."""
     centers = torch.stack([photo.center for photo in photos])
     looks = torch.stack([F.normalize(photo.directions.sum(dim=0), dim=0) if len(photo) else torch.zeros(3) for photo in photos])
-    apart = torch.cdist(centers.double(), centers.double())
+    apart = distances_between(centers.double(), centers.double())
     typical = apart[apart > 0].median() if bool((apart > 0).any()) else torch.ones(())
     closeness = (looks @ looks.T).double() - 0.2 * apart / typical
     closeness[apart <= 1e-9 * typical] = -torch.inf
