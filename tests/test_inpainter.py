@@ -274,10 +274,8 @@ def test_a_model_s_own_sampling_is_the_default_everywhere(tmp_path):
     own = {"steps": 3, "guidance_unknown": 2.0, "shift": 1.5, "window": 2}
     model.info["sampling"] = own
     views, recommended = mixed_views(1, 1, 2), SamplingConfig(**own)
-    by_default, asked, usual = (
-        model.complete(views, generator=seeded(), **options)
-        for options in ({}, {"sampling": recommended}, {"sampling": SamplingConfig(steps=3)})
-    )
+    by_default = model.complete(views, generator=seeded())
+    asked, usual = (model.complete(views, generator=seeded(), sampling=one) for one in (recommended, SamplingConfig(steps=3)))
     assert torch.equal(by_default.images, asked.images) and not torch.equal(by_default.images, usual.images)
     assert model.denoising(views, seed=0).sampling == recommended
     assert model.estimate(24, (64, 64)) == model.estimate(24, (64, 64), recommended) != model.estimate(24, (64, 64), SamplingConfig())
