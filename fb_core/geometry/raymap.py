@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -55,32 +55,6 @@ def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
     return torch.stack([right, down, torch.linalg.cross(right, down)], dim=1).to(directions.dtype)
 
 
-def _axes_of_some(directions: Float[Tensor, "3 h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "3 3"]:
-    """`axes_of` from the known rays alone: the pinhole matrix that fits them (up to scale, by its null vector), split into its axes.
-
-    A ray is a multiple of M (x, y, 1) with M = R K^-1, whose second factor is upper triangular with a positive diagonal.
-    Raises ValueError where the rays tell no camera.
-    """
-    height, width = known.shape
-    row, column = known.nonzero(as_tuple=True)
-    rays = directions[:, row, column].T.double()
-    x, y = (2 * (column.double() + 0.5) / width - 1), (2 * (row.double() + 0.5) / height - 1)
-    pixels = torch.stack([x, y, torch.ones_like(x)], dim=1)
-    zeros = torch.zeros_like(rays[:, :1])
-    cross = torch.stack(
-        [torch.cat([zeros, -rays[:, 2:], rays[:, 1:2]], 1), torch.cat([rays[:, 2:], zeros, -rays[:, :1]], 1),
-         torch.cat([-rays[:, 1:2], rays[:, :1], zeros], 1)], dim=1,
-    )  # fmt: skip
-    equations = torch.einsum("nij,nk->nijk", cross, pixels).flatten(2).flatten(0, 1)
-    _, values, vectors = torch.linalg.svd(equations.T @ equations)
-    if not len(rays) or not float(values[-2]) > 1e-12 * float(values[0]):
-        raise ValueError("canonical frame: the known rays of the first posed view tell no camera; expected some in two rows and columns")
-    matrix = vectors[-1].view(3, 3)
-    matrix = matrix * torch.sign((rays * (pixels @ matrix.T)).sum())
-    axes, upper = torch.linalg.qr(matrix)
-    return (axes * torch.sign(upper.diagonal())).to(directions.dtype)
-
-
 def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """Files hold rounded rotations, but only a true one makes a frame with an exact inverse. Refuses what is no rotation at all."""
     error = float((matrix.T @ matrix - torch.eye(3, dtype=matrix.dtype)).abs().max())
@@ -119,27 +93,11 @@ class CanonicalFrame:
 
     @staticmethod
     def of_raymaps(
-        raymaps: Float[Tensor, "n 6 h w"],
-        *,
-        known: Float[Tensor, "n 1 h w"] | None = None,
-        reference: int = 0,
-        heading_radians: float = 0.0,
-        fill: float = 1.0,
+        raymaps: Float[Tensor, "n 6 h w"], *, reference: int = 0, heading_radians: float = 0.0, fill: float = 1.0
     ) -> CanonicalFrame:
-        """The same frame from the raymaps of pinhole cameras alone. Sides of at least 2 pixels.
-
-        ``known`` marks the rays that count (above 0; default: all); what stands in others may be anything. Every view needs a known ray,
-        the reference at least two rows and two columns with known rays in both, else ValueError.
-        """
-        whole = known is None or bool((known > 0).all())
-        if whole:
-            rotation = axes_of(raymaps[reference, 3:])
-            centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
-        else:
-            counts = known > 0
-            rotation = _axes_of_some(raymaps[reference, 3:], counts[reference, 0])
-            origins = torch.where(counts, raymaps[:, :3], torch.zeros_like(raymaps[:, :3])).double()
-            centers = (origins.flatten(2).sum(dim=2) / counts.flatten(2).sum(dim=2)).to(raymaps.dtype)
+        """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
+        rotation = axes_of(raymaps[reference, 3:])
+        centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
         return CanonicalFrame._around(rotation, centers[reference], centers, heading_radians, fill)
 
     @staticmethod
