@@ -30,7 +30,7 @@ def data_from(state: Float[Tensor, "b *rest"], predicted: Float[Tensor, "b *rest
 
 def logit_normal_times(count: int, *, generator: torch.Generator) -> Float[Tensor, "b"]:
     """Training times in (0, 1): the sigmoid of a standard normal, as in Esser et al. 2024."""
-    return torch.sigmoid(torch.randn(count, generator=generator, device=generator.device))
+    return torch.sigmoid(torch.randn(count, generator=generator, device=generator.device, dtype=torch.float32))
 
 
 def masked_loss(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fb_core import checkpoint
 from fb_core.conditioning import LATENT_CHANNELS, decode_in_chunks, encode_in_chunks, encode_known, encode_null, only_known, split, unsplit
+from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
 from fb_core.masks import to_latent_grid
 from fb_core.memory import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
@@ -144,12 +145,11 @@ class Fillerbuster:
         cut = self._cut(len(views), views.size, sampling, prompt)
         seed = None if resume is None else resume.seed
         seed = int(torch.randint(0, 2**62, (), generator=generator)) if seed is None else seed
-        height, width = views.size
-        placed = views.to(self.device)
-        padded, frame = _padded(placed), _frame_of(placed)
+        ready = _working(views, self.device)
+        frame, padded = frame_of_known_rays(ready.raymaps, ready.rays_known), _padded(ready)
         started = counts = guess = None
         if current is not None:
-            current = _padded(current.to(self.device), mode="replicate")
+            current = _padded(_working(current, self.device), mode="replicate")
             guess = current if sampling.guess != "start" else None
             if sampling.guess == "told":
                 sampling = dataclasses.replace(sampling, strength=1.0)
@@ -167,10 +167,7 @@ class Fillerbuster:
             stopped.seed = seed
             raise
         del denoising
-        filled = self._decode(padded, latents, frame, cut)
-        return dataclasses.replace(
-            filled, **{f.name: getattr(filled, f.name)[..., :height, :width].to(views.images.device) for f in dataclasses.fields(Views)}
-        )
+        return _as_given(self._decode(padded, latents, frame, cut), views)
 
     def recover_raymaps(
         self, images: Float[Tensor, "n 3 h w"], *, generator: torch.Generator, sampling: SamplingConfig | None = None
@@ -221,9 +218,10 @@ class Fillerbuster:
         """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
         _check(views)
         sampling = self.recommended_sampling if sampling is None else sampling
-        padded = _padded(views.to(self.device))
+        ready = _working(views, self.device)
+        frame, padded = frame_of_known_rays(ready.raymaps, ready.rays_known), _padded(ready)
         cut = self._cut(len(views), views.size, sampling, None)
-        return self._denoising(padded, _frame_of(views.to(self.device)), None, None, self._text_of(None), seed, sampling, cut)
+        return self._denoising(padded, frame, None, None, self._text_of(None), seed, sampling, cut)
 
     def _denoising(
         self,
@@ -238,14 +236,14 @@ class Fillerbuster:
         guess: Views | None = None,
     ) -> Denoising:
         """What is known of the padded views, encoded, with all draws."""
-        canonical = only_known(views.raymaps, views.rays_known)
+        canonical = torch.where(views.rays_known > 0, views.raymaps, 0.0)
         if frame is not None:
-            canonical = only_known(frame.apply(canonical), views.rays_known)
+            canonical = frame.apply(canonical)
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
         conditioning = encode_known(
             views.images,
             views.image_known,
-            to_unit_range(canonical),
+            to_unit_range(canonical).float(),
             views.rays_known,
             **vaes,
             views_at_once=cut.views_encoded,
@@ -271,8 +269,11 @@ class Fillerbuster:
     def _encoded(self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
         images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(current.images, current.image_known)
-        raymaps = torch.where(views.rays_known > 0, views.raymaps, only_known(current.raymaps, current.rays_known))
-        raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1)
+        raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps.to(views.raymaps))
+        there = views.rays_known.maximum(current.rays_known) > 0
+        raymaps = torch.where(there, raymaps, 0.0)
+        raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1).float()
+        raymaps01 = torch.where(there, raymaps01, 0.0)  # as in what is known; 0 of the world would be a place that depends on the world
         return unsplit(
             encode_in_chunks(self.image_vae, images, cut.views_encoded), encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded)
         )
@@ -286,10 +287,10 @@ class Fillerbuster:
             known = views.image_known[todo]
             generated = decode_in_chunks(self.image_vae, image_latents[todo], cut.views_decoded, cut.tile)
             images[todo] = images[todo] + (1 - known) * generated
-        raymaps = only_known(views.raymaps, views.rays_known)
-        todo = (views.rays_known < 1).flatten(1).any(dim=1)
+        raymaps = torch.where(views.rays_known > 0, views.raymaps, 0.0)
+        todo = (views.rays_known <= 0).flatten(1).any(dim=1)
         if bool(todo.any()):
-            recovered = from_unit_range(decode_in_chunks(self.raymap_vae, ray_latents[todo], cut.views_decoded, cut.tile))
+            recovered = from_unit_range(decode_in_chunks(self.raymap_vae, ray_latents[todo], cut.views_decoded, cut.tile)).to(raymaps)
             recovered = recovered if frame is None else frame.invert(recovered)
             raymaps[todo] = torch.where(views.rays_known[todo] > 0, raymaps[todo], recovered)
         ones = torch.ones_like(views.image_known)
@@ -337,16 +338,20 @@ def _padded(views: Views, *, mode: str = "constant") -> Views:
     return dataclasses.replace(views, **{f.name: F.pad(getattr(views, f.name), extra, mode=mode) for f in dataclasses.fields(Views)})
 
 
-def _frame_of(views: Views) -> CanonicalFrame | None:
-    """The canonical frame of the posed views, upright in the first of them; None when no view has half of its rays.
+def _working(views: Views, device: torch.device) -> Views:
+    """As the networks take them: float32; raymaps that are more exact stay so until they are in the canonical frame."""
+    exact = torch.float32 if device.type == "mps" else torch.promote_types(views.raymaps.dtype, torch.float32)
+    single = {f.name: getattr(views, f.name).to(device, torch.float32) for f in dataclasses.fields(Views)}
+    return dataclasses.replace(views, **single | {"raymaps": views.raymaps.to(device, exact)})
 
-    Views as they are given, not padded: what is unknown, padding included, decides nothing.
-    """
-    known = views.rays_known > 0
-    posed = known.flatten(1).float().mean(dim=1) >= 0.5
-    if not bool(posed.any()):
-        return None
-    return CanonicalFrame.of_raymaps(views.raymaps[posed], known=views.rays_known[posed])
+
+def _as_given(filled: Views, views: Views) -> Views:
+    """Cut to the size of the views, on their device and in their precision; what they know keeps its bits."""
+    height, width = views.size
+    cut = {f.name: getattr(filled, f.name)[..., :height, :width].to(getattr(views, f.name)) for f in dataclasses.fields(Views)}
+    cut["images"] = torch.where(views.image_known < 1, cut["images"], views.images)
+    cut["raymaps"] = torch.where(views.rays_known > 0, views.raymaps, cut["raymaps"])
+    return Views(**cut)
 
 
 __all__ = ["BUNDLED_MODEL", "LATENT_CHANNELS", "Fillerbuster", "SamplingConfig", "noise_of"]

@@ -30,7 +30,7 @@ def partly_known(height: int, width: int, *, generator: torch.Generator, device:
 
     The draws are those of the generator, on the CPU; the mask is made on the device, all rectangles at once.
     """
-    draws = [torch.rand(5, generator=generator) for _ in range(int(torch.randint(2, 11, (), generator=generator)))]
+    draws = [torch.rand(5, generator=generator, dtype=torch.float32) for _ in range(int(torch.randint(2, 11, (), generator=generator)))]
     size_y, size_x, y, x, turn = torch.stack(draws).double().to(device)[..., None, None].unbind(1)
     down, along_row = ((torch.arange(side, device=device) + 0.5).double() for side in (height, width))
     down, right = down[:, None] - y * height, along_row - x * width
@@ -60,7 +60,7 @@ def training_mixture(
     unknown = count // 2 if unknown is None else unknown
     if known + unknown > count:
         raise ValueError(f"training mixture: {known} known and {unknown} unknown views do not fit into {count} views")
-    masks = torch.zeros(count, 1, height, width, device=device)
+    masks = torch.zeros(count, 1, height, width, device=device, dtype=torch.float32)
     order = torch.arange(count) if in_order else torch.randperm(count, generator=generator)
     masks[order[:known]] = 1.0
     for view in order[known + unknown :].tolist():
@@ -70,7 +70,7 @@ def training_mixture(
 
 def drop_conditioning(generator: torch.Generator, *, share: float = 0.1) -> tuple[bool, bool]:
     """(drop images, drop rays): with probability ``share`` something is dropped, equally images, rays, or both (paper, appendix)."""
-    if float(torch.rand((), generator=generator)) >= share:
+    if float(torch.rand((), generator=generator, dtype=torch.float32)) >= share:
         return False, False
     which = int(torch.randint(0, 3, (), generator=generator))
     return which in (0, 2), which in (1, 2)

@@ -56,11 +56,18 @@ def position_noise(
     generator: torch.Generator | None = None,
 ) -> Float[Tensor, "n 3"]:
     """Covariance times white noise times ``size``, for Gaussians of opacity up to about 0.005; hardly any for opaque ones."""
+    given = log_scales.dtype
+    quats, log_scales, opacities = _exact(quats), _exact(log_scales), _exact(opacities)
     rotation, squares = rotations(unit_quaternions(quats)[0]), (2 * log_scales).exp()
     white = torch.randn(log_scales.shape, generator=generator, dtype=log_scales.dtype, device=log_scales.device)
     body = torch.einsum("ijn,ni->nj", rotation, white) * squares
     gate = torch.sigmoid(_GATE_SLOPE * (_GATE_CENTER - opacities))
-    return torch.einsum("ijn,nj->ni", rotation, body) * (size * gate)[:, None]
+    return (torch.einsum("ijn,nj->ni", rotation, body) * (size * gate)[:, None]).to(given)
+
+
+def _exact(values: Tensor) -> Tensor:
+    """At least float32: in half precision an opacity of 0.9998 is 1, whose logit is infinite, and a scale of 1e-8 is 0."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def penalize(values: Float[Tensor, "..."], weight: float) -> None:
@@ -98,10 +105,11 @@ class CappedMCMC(MCMCStrategy):
     ) -> None:
         """Relocate, grow and stir, after the optimizers' step. ``lr`` is that of the means, by default their optimizer's."""
         rate: float = optimizers["means"].param_groups[0]["lr"] if lr is None else lr
-        self._stir(params, rate * self.noise_lr)  # first: the gradients belong to these rows
-        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-            self._relocate(params, optimizers)
-            self._grow(params, optimizers, state)
+        with torch.autocast(params["means"].device.type, enabled=False):  # parameters keep their own precision
+            self._stir(params, rate * self.noise_lr)  # first: the gradients belong to these rows
+            if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
+                self._relocate(params, optimizers)
+                self._grow(params, optimizers, state)
 
     @torch.no_grad()
     def _stir(self, params: Any, size: float) -> None:
@@ -110,14 +118,14 @@ class CappedMCMC(MCMCStrategy):
         if gradient is None:
             return
         drawn = (gradient != 0).any(dim=-1).nonzero()[:, 0]
-        opacities = params["opacities"][drawn].flatten().sigmoid()
+        opacities = _exact(params["opacities"][drawn]).flatten().sigmoid()
         noise = position_noise(params["quats"][drawn], params["scales"][drawn], opacities, size)
-        means.index_add_(0, drawn, noise)
+        means.index_add_(0, drawn, noise.to(means))
 
     @torch.no_grad()
     def _relocate(self, params: Any, optimizers: dict[str, torch.optim.Optimizer]) -> int:
         """Move dead Gaussians onto living ones, drawn by opacity; returns how many."""
-        opacities = params["opacities"].flatten().sigmoid()
+        opacities = _exact(params["opacities"]).flatten().sigmoid()
         dead = opacities <= self.min_opacity
         source, moved = self._sources(opacities, dead, int(dead.sum())), dead.nonzero()[:, 0]
         if source is None or len(moved) == 0:
@@ -133,7 +141,7 @@ class CappedMCMC(MCMCStrategy):
         """Add a twentieth, at most up to the cap, as copies of living ones drawn by opacity; returns how many."""
         number = len(params["means"])
         wanted = max(0, min(self.cap_max, int(1.05 * number)) - number)
-        opacities = params["opacities"].flatten().sigmoid()
+        opacities = _exact(params["opacities"]).flatten().sigmoid()
         source = self._sources(opacities, opacities <= self.min_opacity, wanted)
         if source is None:
             return 0
@@ -158,9 +166,10 @@ class CappedMCMC(MCMCStrategy):
         """Give each source the opacity and scale that it and its copies need."""
         places, copies = source.unique(return_counts=True)
         opacities, scales = params["opacities"], params["scales"]
-        shared, shrunk = shared_opacity_and_scale(opacities[places].flatten().sigmoid(), scales[places].exp(), copies + 1)
-        opacities[places] = torch.logit(shared.clamp(self.min_opacity, _MOST_OPAQUE)).view(-1, *opacities.shape[1:])
-        scales[places] = shrunk.log()
+        whole = _exact(opacities[places]).flatten().sigmoid()
+        shared, shrunk = shared_opacity_and_scale(whole, _exact(scales[places]).exp(), copies + 1)
+        opacities[places] = torch.logit(shared.clamp(self.min_opacity, _MOST_OPAQUE)).view(-1, *opacities.shape[1:]).to(opacities)
+        scales[places] = shrunk.log().to(scales)
 
 
 def _clear_moments(optimizer: torch.optim.Optimizer, parameter: Tensor, rows: Tensor) -> None:

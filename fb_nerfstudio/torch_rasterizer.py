@@ -91,7 +91,7 @@ def rasterization(
         semantics=SEMANTICS[semantics],
     )
     with single_thread():
-        usable, dropped = _usable(means, quats, scales, opacities, covars)
+        usable, dropped = _usable(means, quats, scales, opacities, covars, _used_colors(colors, sh_degree, render_mode))
         if usable is not None:
             opacities = opacities.masked_fill(~usable, 0.0)
         projection = project_splats(means, quats, scales, opacities, covars, viewmats, Ks, usable, settings)
@@ -108,10 +108,18 @@ def rasterization(
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
 
 
-def _usable(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, covars: Tensor | None):
+def _used_colors(colors: Tensor, sh_degree: int | None, render_mode: RenderMode) -> Tensor | None:
+    """What of the colours takes part, Gaussians first: no coefficients above the degree, and none of them in pictures of depth alone."""
+    if render_mode in ("D", "ED"):
+        return None
+    used = colors if sh_degree is None else colors[..., : (sh_degree + 1) ** 2, :]
+    return used.transpose(0, 1) if used.ndim == (3 if sh_degree is None else 4) else used
+
+
+def _usable(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, covars: Tensor | None, colors: Tensor | None):
     """Which Gaussians have finite values only (None = all of them), and how many have not."""
     with torch.no_grad():
-        given = [t for t in (means, quats, scales, covars) if t is not None]
+        given = [t for t in (means, quats, scales, covars, colors) if t is not None]
         if bool(torch.stack([t.sum() for t in (*given, opacities)]).isfinite().all()):  # the quickest look at all of them
             return None, 0
         finite = opacities.isfinite()
@@ -234,6 +242,11 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgr
     _expect("opacities", opacities, (number,), means)
     _expect("viewmats", viewmats, (cameras, 4, 4), means)
     _expect("Ks", Ks, (cameras, 3, 3), means)
+    for name, tensor in {"viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds}.items():
+        if tensor is not None and not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} should be finite but holds NaN or infinity: leave that camera out or repair it.")
+    if not bool((Ks[:, [0, 1], [0, 1]] > 0).all()):
+        raise ValueError(f"Ks should have focal lengths above 0 but has {Ks[:, [0, 1], [0, 1]].tolist()}.")
     if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
         raise ValueError(f"render_mode should be RGB, D, ED, RGB+D or RGB+ED but is {render_mode!r}.")
     if render_mode in ("D", "ED"):

@@ -9,8 +9,9 @@ import torch
 from tiny_models import tiny_model
 
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.raymap import CanonicalFrame, axes_of, raymaps_of
-from fb_core.inpainter import Fillerbuster, SamplingConfig, _frame_of
+from fb_core.geometry.known_rays import frame_of_known_rays
+from fb_core.geometry.raymap import CanonicalFrame
+from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.views import Views
 
 QUICK = SamplingConfig(steps=1, guidance_unknown=1.0, guidance_known=1.0)
@@ -40,7 +41,9 @@ def some_views(cameras: Pinholes) -> Views:
 @pytest.mark.parametrize("size", SIZES)
 def test_every_size_has_the_frame_of_its_cameras(size):
     cameras = some_cameras(size, size + size % 5)
-    frame, expected = _frame_of(some_views(cameras)), CanonicalFrame.of(cameras)
+    views = some_views(cameras)
+    frame, expected = frame_of_known_rays(views.raymaps, views.rays_known), CanonicalFrame.of(cameras)
+    assert frame is not None
     torch.testing.assert_close(frame.rotation, expected.rotation, atol=1e-5, rtol=0)
     torch.testing.assert_close(frame.center, expected.center, atol=1e-6, rtol=0)
     assert frame.scale == pytest.approx(expected.scale, rel=1e-5)
@@ -66,28 +69,3 @@ def test_a_moved_world_in_another_unit_changes_nothing_but_the_world(model, size
     here, there = some_views(some_cameras(size, size)), some_views(some_cameras(size, size, moved=16.0, unit=2.0))
     answers = [model.complete(views, generator=torch.Generator().manual_seed(0), sampling=QUICK).images for views in (here, there)]
     torch.testing.assert_close(answers[0], answers[1], atol=2e-4, rtol=0)
-
-
-@pytest.mark.parametrize("part", ["left", "few", "scattered"])
-def test_axes_from_some_rays_are_those_from_all(part):
-    cameras = some_cameras(24, 20).cropped(2, 3, 20, 14)
-    rays = raymaps_of(cameras)
-    known = torch.zeros(3, 1, 14, 20)
-    if part == "left":
-        known[..., :7] = 1
-    elif part == "few":
-        known[..., 3:5, 6:8] = 1
-    else:
-        known = (torch.rand(3, 1, 14, 20, generator=torch.Generator().manual_seed(0)) < 0.3).float()
-    frame, whole = CanonicalFrame.of_raymaps(rays.double(), known=known), CanonicalFrame.of_raymaps(rays.double())
-    torch.testing.assert_close(frame.rotation, whole.rotation, atol=1e-4, rtol=0)
-    torch.testing.assert_close(axes_of(rays[0, 3:]), cameras.rotations[0], atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("rows, columns", [(1, 9), (9, 1), (1, 1)])
-def test_rays_of_one_row_or_column_tell_no_camera(rows, columns):
-    rays = raymaps_of(some_cameras(24, 20))
-    known = torch.zeros(3, 1, 20, 24)
-    known[..., :rows, :columns] = 1
-    with pytest.raises(ValueError, match="tell no camera"):
-        CanonicalFrame.of_raymaps(rays, known=known)

@@ -89,7 +89,9 @@ class CanonicalFrame:
         """
         if len(cameras) == 0:
             raise ValueError("canonical frame: expected at least one camera, got none; pass the captured cameras")
-        return CanonicalFrame._around(cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians, fill)
+        return CanonicalFrame.around(
+            cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians=heading_radians, fill=fill
+        )
 
     @staticmethod
     def of_raymaps(
@@ -98,17 +100,18 @@ class CanonicalFrame:
         """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
         rotation = axes_of(raymaps[reference, 3:])
         centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
-        return CanonicalFrame._around(rotation, centers[reference], centers, heading_radians, fill)
+        return CanonicalFrame.around(rotation, centers[reference], centers, heading_radians=heading_radians, fill=fill)
 
     @staticmethod
-    def _around(
+    def around(
         rotation_camera: Float[Tensor, "3 3"],
         center: Float[Tensor, " 3"],
         all_centers: Float[Tensor, "n 3"],
-        heading_radians: float,
-        fill: float,
+        *,
+        heading_radians: float = 0.0,
+        fill: float = 1.0,
     ) -> CanonicalFrame:
-        """The frame that is upright in one camera and holds all centres. Reckoned in float64 on the CPU (a few numbers)."""
+        """The frame that is upright in a camera-to-world rotation and holds all centres. In float64 on the CPU (a few numbers)."""
         axes = _nearest_rotation(rotation_camera.detach().cpu().double())
         centers = all_centers.detach().cpu().double()
         flip = axes.new_tensor([1.0, -1.0, -1.0]).diag()  # OpenCV axes to y up, z backward

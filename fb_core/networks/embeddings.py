@@ -72,11 +72,11 @@ def index_positions(
     if mode not in INDEX_MODES:
         raise ValueError(f"mode: expected one of {', '.join(INDEX_MODES)}, got {mode!r}.")
     if mode == "none":
-        return torch.zeros(batch, views, device=device)
+        return torch.zeros(batch, views, device=device, dtype=torch.float32)
     if mode == "flexible" and generator is not None:
-        drawn = torch.rand(batch, views, generator=generator, device=generator.device)
+        drawn = torch.rand(batch, views, generator=generator, device=generator.device, dtype=torch.float32)
         return (2 * math.pi * drawn).to(device or generator.device)
-    return torch.linspace(0, 2 * math.pi, views, device=device).expand(batch, views)
+    return torch.linspace(0, 2 * math.pi, views, device=device, dtype=torch.float32).expand(batch, views)
 
 
 def timestep_embedding(timesteps: Float[Tensor, "b"], channels: int) -> Float[Tensor, "b channels"]:

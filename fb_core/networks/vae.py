@@ -256,9 +256,10 @@ class VAE(nn.Module):
         mean, logvar = self.posterior(x01)
         if generator is not None:
             if isinstance(generator, torch.Generator):
-                noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean)
+                noise = torch.randn(mean.shape, generator=generator, device=generator.device, dtype=torch.float32).to(mean)
             else:
-                noise = torch.stack([torch.randn(mean.shape[1:], generator=one, device=one.device) for one in generator]).to(mean)
+                drawn = [torch.randn(mean.shape[1:], generator=one, device=one.device, dtype=torch.float32) for one in generator]
+                noise = torch.stack(drawn).to(mean)
             mean = mean + (0.5 * logvar).exp() * noise
         return self.config.scaling * mean
 

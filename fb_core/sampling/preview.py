@@ -27,7 +27,7 @@ class LatentColors:
     @torch.no_grad()
     def of(vae: VAE) -> LatentColors:
         """Fit the map on random smooth pictures; takes one small encoding."""
-        colors = torch.rand(_PICTURES, 3, _PATCHES, _PATCHES, generator=generator_of(0))
+        colors = torch.rand(_PICTURES, 3, _PATCHES, _PATCHES, generator=generator_of(0), dtype=torch.float32)
         device = next(vae.parameters()).device
         pictures = F.interpolate(colors.to(device), size=(_SIDE, _SIDE), mode="bilinear", align_corners=True)
         latents = vae.encode(pictures).permute(0, 2, 3, 1).flatten(0, 2).double().cpu()

@@ -39,7 +39,8 @@ def generator_of(seed: int, *places: int) -> torch.Generator:
 
 def noise_of(seed: int, views: int, latent_size: tuple[int, int]) -> Float[Tensor, "n 32 h w"]:
     """Initial noise on the CPU; a view's noise depends on the seed and its place alone, not on how many views there are."""
-    return torch.stack([torch.randn(STATE_CHANNELS, *latent_size, generator=generator_of(seed, view)) for view in range(views)])
+    shape = (STATE_CHANNELS, *latent_size)
+    return torch.stack([torch.randn(shape, generator=generator_of(seed, view), dtype=torch.float32) for view in range(views)])
 
 
 def posterior_generators(seed: int, views: int) -> list[torch.Generator]:

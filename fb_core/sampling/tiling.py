@@ -48,7 +48,7 @@ def tiled(predict: Predict, *, window: int | None, rounds: int = 1, orders: Orde
         if window is None or window >= count:
             return predict(state, time, views)
         total: Tensor | None = None
-        visits = torch.zeros(count, device=state.device)
+        visits = torch.zeros(count, device=state.device, dtype=torch.float32)
         for number in range(rounds):
             for part in windows(count, window, order=orders(time, number, count).to(state.device)):
                 velocities = predict(state[part], time, part if views is None else views[part]).float()
