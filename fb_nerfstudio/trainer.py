@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.files.faults import telling
 from fb_core.files.whole import unfinished_beside, whole_file
+from fb_core.interruption import stop_on_signals
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
 
 
@@ -28,8 +31,20 @@ class FillerbusterTrainerConfig(TrainerConfig):
 
     def set_timestamp(self) -> None:
         """Name the run. This is the first thing ``ns-train`` does with its options, so it is here that bad input is refused."""
+        stop_on_signals(self._stop)
         self.refuse_bad_input()
         super().set_timestamp()
+
+    def _stop(self, number: int) -> NoReturn:
+        """Ends the command with one line. A SystemExit: nerfstudio would print KeyboardInterrupt's traceback and report success.
+
+        A second signal ends it at once, whatever is still being cleaned up: files are whole or absent, and the rest is cleaned up later.
+        """
+        signal.signal(number, signal.SIG_DFL)
+        checkpoints = self.get_checkpoint_dir() if any(self.get_checkpoint_dir().glob("step-*.ckpt")) else self.load_dir
+        advice = "nothing was saved yet" if checkpoints is None else f"go on with --load-dir {checkpoints}"
+        sys.stderr.write(f"\nStopped; {advice}.\n")
+        raise SystemExit(128 + number)
 
     def refuse_bad_input(self) -> None:
         """Raises Refused with one sentence for what cannot be trained on: devices, capture, model folder, checkpoint to go on from.
@@ -91,6 +106,11 @@ class FillerbusterTrainer(Trainer):
                 raise Refused(f"checkpoint {given}: not readable as plain values ({told}); give one that ns-train has saved") from None
         super()._load_checkpoint()
 
+    def _train_complete_viewer(self) -> None:
+        """As nerfstudio, which shows the finished scene until Ctrl-C; that is then the regular end."""
+        stop_on_signals(_end)
+        super()._train_complete_viewer()
+
     def train_iteration(self, step: int) -> Any:
         """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed run repeats them."""
         seed = np.random.SeedSequence([self.config.machine.seed, step]).generate_state(1, np.uint64)[0]
@@ -113,3 +133,7 @@ class FillerbusterTrainer(Trainer):
                 for old in folder.glob("*.ckpt") if self.config.save_only_latest_checkpoint else ():
                     if old.name != path.name:
                         old.unlink()
+
+
+def _end(number: int) -> NoReturn:
+    raise SystemExit(0)

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,20 +15,18 @@ from typing import Annotated, Literal
 import tyro
 
 from fb_core.files.faults import sentence_of
+from fb_core.interruption import ENDED_BY_USER, stop_on_signals
 from method_configs.ablation_evaluation import Ablations
 from method_configs.bench_command import Networks, Precision
 from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
 from method_configs.methods_benchmark import Methods
 from method_configs.scaling_evaluation import Scaling
 from method_configs.uncalibrated_evaluation import Uncalibrated
-
-DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
-"""Environment variable that, set to anything, shows the traceback of an error."""
-_ENDED_BY_USER = 130  # what shells report for a command ended by Ctrl-C
 
 
 def rooms(
@@ -334,8 +330,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """The console script. An error that a user can mend is one sentence on stderr and a non-zero exit code."""
     _show_log()
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that children are ended on the way out
+    stop_on_signals()
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
@@ -344,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=None if arguments is None else list(arguments),
         )
     except KeyboardInterrupt as error:
-        _stop(error, "Stopped.", _ENDED_BY_USER)
+        _stop(error, "Stopped.", ENDED_BY_USER)
     except (ValueError, FloatingPointError, OSError) as error:
         _stop(error, f"Error: {sentence_of(error)}", 1)
 

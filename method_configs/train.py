@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fb_core.files.faults import sentence_of
+from fb_core.interruption import ENDED_BY_USER, stop_on_signals
 from method_configs.training_command import train_preset
 
 
@@ -23,8 +24,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", stream=sys.stderr)
     for package in ("fb_core", "method_configs"):
         logging.getLogger(package).setLevel(logging.INFO if os.environ.get("RANK", "0") == "0" else logging.WARNING)
+    stop_on_signals()
     try:
         train_preset(**vars(parser().parse_args(arguments)))
+    except KeyboardInterrupt:
+        sys.stderr.write("Stopped.\n")
+        sys.exit(ENDED_BY_USER)
     except (ValueError, FloatingPointError, OSError) as error:
         sys.exit(f"Error: {sentence_of(error)}")
 

@@ -14,7 +14,7 @@ PACKAGES = ("fb_core", "fb_nerfstudio", "method_configs")
 # From left to right: a module may import its own floor and the floors before it.
 FLOORS = (
     (
-        *("fb_core.files", "fb_core.machine", "fb_core.limits", "fb_core.json_files"),
+        *("fb_core.files", "fb_core.machine", "fb_core.limits", "fb_core.json_files", "fb_core.interruption"),
         *("fb_core.geometry", "fb_core.networks", "fb_core.masks"),
     ),
     ("fb_core.views", "fb_core.conditioning", "fb_core.flow", "fb_core.sampler", "fb_core.sampling"),

@@ -1,4 +1,4 @@
-"""Signals that ask a training to end: a cluster that takes its machine back, a job whose time is nearly up."""
+"""Signals that ask a training to end: Ctrl-C, a cluster that takes its machine back, a job whose time is nearly up."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import signal
 import threading
 from typing import Any
 
-STOPPING = (signal.SIGTERM, signal.SIGUSR1)
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 class StopSignal:
-    """A context manager that notes a signal instead of dying from it: ``with StopSignal() as stop: ... if stop.number: ...``."""
+    """A context manager that notes a signal instead of dying from it: ``with StopSignal() as stop: ... if stop.number: ...``.
+
+    Whoever presses Ctrl-C twice does not want to wait for the end of the step: the second one is a KeyboardInterrupt.
+    """
 
     def __init__(self) -> None:
         self.number = 0
@@ -27,4 +30,6 @@ class StopSignal:
             signal.signal(number, handler)
 
     def _note(self, number: int, frame: object) -> None:
+        if number == self.number == signal.SIGINT:
+            raise KeyboardInterrupt
         self.number = number
