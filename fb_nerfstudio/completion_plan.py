@@ -108,7 +108,7 @@ def plan_completion(
         size: side of the generated views in pixels.
         known: of each captured picture its known part (a mask of any size, None for all of it); without, all of them are known.
     """
-    cameras = [camera.to("cpu", torch.float32) for camera in cameras]
+    cameras = [camera.to("cpu", torch.float64) for camera in cameras]  # a scene may lie far from the origin
     shape = CaptureShape.of(cameras)
     points = thinned_points(points, shape)
     site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, known=known, placement=config.placement)
@@ -140,7 +140,8 @@ def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig
         centers = site.centers(role, views, generator)
         targets, need = site.targets(centers, need, half_angle, generator)
         new = Pinholes.looking_at(centers, targets, up=site.shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size)
-        rounds.append(PlannedRound(number=number, role=role, seed=round_seed(config.seed, number), cameras=new, prompt=config.prompt))
+        new, seed = new.to(torch.float32), round_seed(config.seed, number)
+        rounds.append(PlannedRound(number=number, role=role, seed=seed, cameras=new, prompt=config.prompt))
     return rounds
 
 
@@ -245,7 +246,7 @@ def thinned_points(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, 
         return shape.center.new_empty(0, 3)
     points = points.detach().cpu().to(shape.center)
     points = points[torch.isfinite(points).all(dim=1)]
-    return points[torch.linspace(0, len(points) - 1, min(len(points), _PLANNING_POINTS)).long()]
+    return points[torch.linspace(0, len(points) - 1, min(len(points), _PLANNING_POINTS), dtype=torch.float64).long()]
 
 
 def shell_of(shape: CaptureShape, points: Tensor) -> Shell:

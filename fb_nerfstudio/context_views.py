@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.distances import distances_between
-from fb_core.geometry.paths import seen_by, up_of
+from fb_core.geometry.paths import distances, seen_by, up_of
 from fb_core.geometry.shell import Shell, intersect
 
 _RAYS_ACROSS = 12  # rays per side of a new view that its overlap with captured pictures is judged by
@@ -37,8 +36,8 @@ def nearest_context(
         count: how many to choose; all when there are fewer.
         known: of each captured picture its known part, None for all of it; without, all of them are known.
     """
-    cameras = [camera.to("cpu", torch.float32) for camera in cameras]
-    small = targets.to("cpu", torch.float32).scaled(_RAYS_ACROSS, _RAYS_ACROSS)
+    cameras = [camera.to("cpu", torch.float64) for camera in cameras]
+    small = targets.to("cpu", torch.float64).scaled(_RAYS_ACROSS, _RAYS_ACROSS)
     directions = small.directions().reshape(-1, 3)
     origins = small.centers.repeat_interleave(_RAYS_ACROSS**2, dim=0)
     distance = intersect(shell, origins, directions)
@@ -63,6 +62,5 @@ def _nearness(cameras: Sequence[Pinholes], targets: Pinholes) -> Float[Tensor, "
     """From 1 for a captured camera in the place and direction of a target towards 0 far away."""
     poses = torch.cat([camera.camera_to_world for camera in cameras])
     extent = float((poses[:, :, 3] - poses[:, :, 3].mean(dim=0)).norm(dim=1).max())
-    away = distances_between(poses[:, :, 3], targets.centers) / max(extent, 1e-9)
-    away = away + distances_between(poses[:, :, 2], targets.camera_to_world[:, :, 2])
-    return (1 / (1 + away.min(dim=1).values)).double()
+    away = distances(poses[:, :, 3], targets.centers) / max(extent, 1e-9) + distances(poses[:, :, 2], targets.camera_to_world[:, :, 2])
+    return 1 / (1 + away.min(dim=1).values)

@@ -200,7 +200,8 @@ def fan_from(request: CompleteFrom, scene: CompletionPlan, *, focal: float, size
     pivot = place if shape.outward else shape.focus
     poses = torch.stack([_turned(pose, shape.up, angle, pivot) for angle in turns])
     like = poses.new_ones(len(poses), 2)
-    return Pinholes(camera_to_world=poses, focal=like * focal, principal=like * (size / 2), width=size, height=size)
+    cameras = Pinholes(camera_to_world=poses, focal=like * focal, principal=like * (size / 2), width=size, height=size)
+    return cameras.to(torch.float32)
 
 
 def key_of(views: CompletedViews, index: int) -> str:

@@ -94,7 +94,7 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
         rendered = render_geometry(model, small)
         groups.append(small.unproject(rendered.depth)[rendered.solid])
     points = torch.cat(groups) if groups else torch.empty(0, 3)
-    return points[torch.linspace(0, len(points) - 1, min(len(points), limit)).long()]
+    return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
 
 
 def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:
@@ -126,22 +126,22 @@ def find_unseen(
         rendered: the splats from the views' cameras made coarse, or None while they are untrained.
         known: of each captured picture :func:`coarse_mask`; without, all of them are known.
     """
-    cameras = coarse(views.cameras)
+    cameras = coarse(views.cameras).to(torch.float64)  # a scene may lie far from the origin
     directions = cameras.directions()
     origins = cameras.centers[:, None, None].expand_as(directions)
     distance = intersect(shell, origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
     points = origins + distance[..., None] * directions
-    surface, covered = points, torch.ones_like(distance, dtype=torch.bool)
+    far = distance.nan_to_num(posinf=1e6 * float(shell.log_radius.max().exp()))
+    surface, covered = origins + far[..., None] * directions, torch.ones_like(distance, dtype=torch.bool)
     if rendered is not None:
         covered = rendered.solid
-        surface = torch.where(covered[..., None], cameras.unproject(rendered.depth), points)
+        surface = torch.where(covered[..., None], cameras.unproject(rendered.depth.double()), surface)
     flat = surface.reshape(-1, 3)
-    finite = torch.nan_to_num(flat, posinf=1e9, neginf=-1e9)
-    nearby = [camera.to("cpu", torch.float32) for camera in captured]
-    inside = seen_by(nearby, finite, known).reshape(covered.shape)
+    nearby = [camera.to("cpu", torch.float64) for camera in captured]
+    inside = seen_by(nearby, flat, known).reshape(covered.shape)
     if rendered is not None:
         wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
-        beside = seen_by([_widened(camera) for camera in nearby], finite, wider).reshape(covered.shape)
+        beside = seen_by([_widened(camera) for camera in nearby], flat, wider).reshape(covered.shape)
         inside |= beside & (rendered.accumulation >= FIRM)
     return Unseen(mask=~(covered & inside), points=points)
 
@@ -199,7 +199,7 @@ def unseen_gaussians(
     images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
     colors = rearrange(F.interpolate(images, size=usable.shape[1:], mode="area"), "n c h w -> n h w c")
     chosen = torch.randperm(int(usable.sum()), generator=generator)[:limit]
-    return unseen.points[usable][chosen], colors[usable][chosen]
+    return unseen.points[usable][chosen].to(colors), colors[usable][chosen]
 
 
 def seen_by_nobody_else(
@@ -221,8 +221,8 @@ def seen_by_nobody_else(
         captured: the capture's cameras.
         known: of each captured picture :func:`coarse_mask`; without, all of them are known.
     """
-    points = means.detach().to("cpu", torch.float32)
-    nearby = [camera.to("cpu", torch.float32) for camera in captured]
+    points = means.detach().to("cpu", torch.float64)
+    nearby = [camera.to("cpu", torch.float64) for camera in captured]
     kept = seen_by(nearby, points, known)
     if staying is not None:
         kept |= _supervised(staying, points)
@@ -230,5 +230,5 @@ def seen_by_nobody_else(
 
 
 def _supervised(views: CompletedViews, points: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
-    cameras = views.cameras.to("cpu", torch.float32)
+    cameras = views.cameras.to("cpu", torch.float64)
     return seen_by([cameras[index] for index in range(len(cameras))], points, [*views.masks[..., 0].cpu()])

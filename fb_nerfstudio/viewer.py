@@ -16,7 +16,7 @@ from jaxtyping import Float
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
-from fb_core.geometry.distances import distances_between
+from fb_core.geometry.paths import distances
 from fb_nerfstudio.completed_views import CompletedViews, round_title
 from fb_nerfstudio.requests import MOST_VIEWS, CompleteFrom, RegenerateRound, RemoveView, Request, RequestQueue, key_of, place_of
 
@@ -317,7 +317,7 @@ def spacing(views: CompletedViews) -> float:
     centers = views.cameras.centers.double().cpu()
     if len(centers) < 2:
         return 0.0
-    return float((distances_between(centers, centers) + torch.diag(torch.full((len(centers),), torch.inf))).min(dim=1).values.median())
+    return float((distances(centers, centers) + torch.diag(torch.full((len(centers),), torch.inf))).min(dim=1).values.median())
 
 
 def _label(views: CompletedViews) -> str:

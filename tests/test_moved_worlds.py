@@ -11,8 +11,7 @@ from torch import Tensor
 from fb_core.geometry.camera_paths import path_cameras
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import carried_over
-from fb_core.geometry.distances import distances_between
-from fb_core.geometry.paths import CaptureShape, cylinder_centers, kept_clear, seen_by, spread_subset, up_of
+from fb_core.geometry.paths import CaptureShape, cylinder_centers, distances, kept_clear, seen_by, spread_subset, up_of
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
 from fb_core.geometry.shell import fit_shell, intersect, sphere
 
@@ -88,8 +87,8 @@ def test_distances_far_from_the_origin_in_single_precision():
     a, b = drawn(60, 3, seed=6), drawn(70, 3, seed=7)
     exact = (a[:, None] - b).norm(dim=-1)
     moved = [(values + NEAR.double()).float() for values in (a, b)]
-    assert float((distances_between(*moved).double() - exact).abs().max()) < 2e-3
-    assert distances_between(a, b[:0]).shape == (60, 0)
+    assert float((distances(*moved).double() - exact).abs().max()) < 2e-3
+    assert distances(a, b[:0]).shape == (60, 0)
 
 
 def test_the_shell():

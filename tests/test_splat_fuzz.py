@@ -170,7 +170,7 @@ def test_one_broken_gaussian_is_left_out_and_costs_no_other_anything(seed: int) 
     told = {key: value.clone() if isinstance(value, Tensor) else value for key, value in plain.items()}
     per_camera = told["colors"].ndim == (3 if options["sh_degree"] is None else 4)
     row = told[name].transpose(0, 1)[broken] if name == "colors" and per_camera else told[name][broken : broken + 1]
-    row.view(-1)[0] = bad
+    row[(0,) * row.ndim] = bad
     keep = [index for index in range(number) if index != broken]
     without = {key: value[:, keep] if key == "colors" and per_camera else value[keep] for key, value in plain.items() if key in LEAVES}
     images, alphas, meta, gradients = rendered(told, options, "gradients")

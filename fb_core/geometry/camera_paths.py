@@ -6,6 +6,7 @@ All of them are closed curves or windings about one axis, walked at even speed, 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.distances import rounding_of
 from fb_core.geometry.paths import CaptureShape
+from fb_core.geometry.similarity import rounding_of
 
 PATHS = ("ellipse", "orbit", "spiral")
 _FINE = 4096  # points of a curve from which even steps are taken
@@ -59,7 +60,7 @@ class Ellipse:
         middle = places.mean(dim=0)
         _, spread, axes = torch.linalg.svd(places - middle, full_matrices=True)
         deviation = F.pad(spread, (0, 3 - len(spread))) / math.sqrt(len(places))
-        if float(deviation[0]) <= max(_ONE_PLACE, rounding_of(centers)):
+        if float(deviation[0]) <= 1e-6 + rounding_of(centers):
             nothing = torch.zeros_like(middle)
             return Ellipse(center=middle.to(centers), first=nothing.to(centers), second=nothing.to(centers))
         along = axes[0]
@@ -93,6 +94,8 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
         raise ValueError(f"path: expected {', '.join(PATHS)} or a camera path's .json file, got {kind!r}")
     if count < 1:
         raise ValueError(f"views: expected at least one view along the path, got {count}")
+    given = cameras[0].camera_to_world.dtype if cameras else torch.float32
+    cameras, origin = _centred(cameras)
     shape = CaptureShape.of(cameras)
     centers = torch.cat([one.centers for one in cameras])
     level = _circle(shape)
@@ -104,7 +107,7 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
         curve, turns = _spiral(shape, level), _SPIRAL_TURNS
     angles = even_angles(curve, count, turns=turns, closed=turns == 1)
     places = curve(angles)
-    return Pinholes.looking_at(
+    new = Pinholes.looking_at(
         places,
         _targets(shape, cameras, places, _outward(places, angles, curve.center if isinstance(curve, Ellipse) else shape.center, shape.up)),
         up=shape.up,
@@ -112,6 +115,19 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
         width=size,
         height=size,
     )
+    return _moved(new, origin).to(given)
+
+
+def _centred(cameras: list[Pinholes]) -> tuple[list[Pinholes], Float[Tensor, "3"]]:
+    """The cameras in float64 about their middle, and where that was: what is reckoned there does not depend on where the world's origin is."""
+    exact = [one.to(torch.float64) for one in cameras]
+    middle = torch.cat([one.centers for one in exact]).mean(dim=0) if exact else torch.zeros(3, dtype=torch.float64)
+    return [_moved(one, -middle) for one in exact], middle
+
+
+def _moved(cameras: Pinholes, shift: Float[Tensor, "3"]) -> Pinholes:
+    poses = torch.cat([cameras.rotations, (cameras.centers + shift)[:, :, None]], dim=2)
+    return dataclasses.replace(cameras, camera_to_world=poses)
 
 
 def even_angles(
@@ -163,7 +179,7 @@ def _outward(
 def _kept_apart(targets: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"], shape: CaptureShape) -> Float[Tensor, "n 3"]:
     """No camera looks at its own place."""
     nearest = 1e-3 * max(shape.radius, 1e-3)
-    aside = shape.center + torch.linalg.cross(shape.up, torch.roll(shape.up, 1))
+    aside = shape.center + _level_across(shape.up, shape.up.roll(1))
     return torch.where((targets - places).norm(dim=1, keepdim=True) < nearest, aside, targets)
 
 

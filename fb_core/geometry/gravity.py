@@ -10,9 +10,9 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import up_of
-from fb_core.geometry.similarity import Similarity
+from fb_core.geometry.similarity import Similarity, rounding_of
 
-_ONE_PLACE = 1e-6  # of the centres' own coordinates: less spread than this is rounding
+_ONE_PLACE = 1e-6  # units of spread that count as none, beside the rounding of the coordinates
 
 
 def upright(cameras: Sequence[Pinholes]) -> Similarity:
@@ -22,10 +22,11 @@ def upright(cameras: Sequence[Pinholes]) -> Similarity:
     keep their scale. Raises ValueError for no camera.
     """
     up = up_of(list(cameras)).double()
+    rounding = max(rounding_of(group.centers) for group in cameras if len(group))
     centers = torch.cat([group.centers.double() for group in cameras])
     middle = centers.mean(dim=0)
     extent = float((centers - middle).norm(dim=1).max())
-    scale = 1 / extent if extent > _ONE_PLACE * (1 + float(centers.abs().max())) else 1.0
+    scale = 1 / extent if extent > _ONE_PLACE + rounding else 1.0
     rotation = turn_between(up, up.new_tensor([0.0, 0.0, 1.0]))
     return Similarity(rotation=rotation, scale=scale, shift=-scale * rotation @ middle)
 

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.distances import distances_between
 from fb_core.geometry.shell import Shell
 
 _CONVERGING = 0.06  # mean squared sine between axes (about 14 degrees): below, the axes are too parallel to meet anywhere
@@ -47,8 +46,9 @@ class CaptureShape:
     def of(cameras: list[Pinholes]) -> CaptureShape:
         """Measure a capture of one or more cameras (sizes may differ). Raises ValueError for none or for NaN poses."""
         poses = _poses(cameras)
+        like, poses = poses, poses.double()
         centers, forward = poses[:, :, 3], poses[:, :, 2]
-        up = up_of(cameras)
+        up = _up(poses)
         focus = _focus(centers, forward)
         axis_point = centers.mean(dim=0) if focus is None else focus
         height = (centers - axis_point) @ up
@@ -58,9 +58,8 @@ class CaptureShape:
         # Rooms: the outer cameras bound the space that was walked. Orbits: all cameras stand on about one radius.
         radius = float(torch.quantile(distance, 0.8) if focus is None else distance.median())
         half_height = float(torch.quantile((height - height.mean()).abs(), 0.8))
-        return CaptureShape(
-            center=center, up=up, radius=radius, half_height=half_height, outward=focus is None, focus=center if focus is None else focus
-        )
+        outward, focus = focus is None, (center if focus is None else focus).to(like)
+        return CaptureShape(center=center.to(like), up=up.to(like), radius=radius, half_height=half_height, outward=outward, focus=focus)
 
 
 def up_of(cameras: list[Pinholes]) -> Float[Tensor, "3"]:
@@ -69,7 +68,11 @@ def up_of(cameras: list[Pinholes]) -> Float[Tensor, "3"]:
     People hold cameras level more surely than upright: looking down at something tilts every camera's up the same way,
     but leaves the right axes horizontal.
     """
-    poses = _poses(cameras).double()
+    poses = _poses(cameras)
+    return _up(poses.double()).to(poses)
+
+
+def _up(poses: Float[Tensor, "n 3 4"]) -> Float[Tensor, "3"]:
     mean = -poses[:, :, 1].mean(dim=0)
     right = poses[:, :, 0]
     spread, axes = torch.linalg.eigh(right.T @ right / len(right))
@@ -77,8 +80,8 @@ def up_of(cameras: list[Pinholes]) -> Float[Tensor, "3"]:
     mean_unit = F.normalize(mean, dim=0)
     is_level = float(spread[0]) < 0.02 and float(spread[1]) > 0.05
     if float(mean.norm()) < 1e-3 or (is_level and float(level @ mean_unit) > math.cos(math.radians(45))):
-        return level.to(cameras[0].camera_to_world.dtype)
-    return mean_unit.to(cameras[0].camera_to_world.dtype)
+        return level
+    return mean_unit
 
 
 def cylinder_centers(
@@ -103,7 +106,7 @@ def cylinder_centers(
         levels: number of equally spaced heights; one level is at the centre's height.
     """
     like = {"device": shape.center.device, "dtype": shape.center.dtype}
-    heading, draws = torch.rand(1, generator=generator), torch.rand(count, generator=generator)
+    heading, draws = (torch.rand(number, generator=generator, dtype=torch.float32) for number in (1, count))
     angle = ((torch.arange(count) / max(count, 1) + heading) * 2 * math.pi).to(**like)
     distance = (inner_radius + (radius - inner_radius) * draws).to(**like)
     level = torch.linspace(-half_height, half_height, levels) if levels > 1 else torch.zeros(1)
@@ -111,6 +114,11 @@ def cylinder_centers(
     first, second = _perpendicular(shape.up)
     around = angle.cos()[:, None] * first + angle.sin()[:, None] * second
     return shape.center + distance[:, None] * around + height[:, None] * shape.up
+
+
+def distances(first: Float[Tensor, "n 3"], second: Float[Tensor, "m 3"]) -> Float[Tensor, "n m"]:
+    """From every point to every other, in float64. Of differences: torch's usual way, by squares, is off by units far from the origin."""
+    return torch.cdist(first.double(), second.double(), compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def kept_clear(
@@ -123,13 +131,13 @@ def kept_clear(
     """
     if len(centers) == 0:
         return centers
-    home = refuges[distances_between(centers, refuges).argmin(dim=1)]
+    home = refuges[distances(centers, refuges).argmin(dim=1)]
     result, settled = home.clone(), torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
     for eighth in range(8):
         place = centers + (home - centers) * (eighth / 8)
         clear = shell.contains(place, margin=0.9)
         if len(points):
-            clear &= distances_between(place, points).min(dim=1).values >= clearance
+            clear &= distances(place, points).min(dim=1).values >= clearance
         chosen = clear & ~settled
         result[chosen] = place[chosen]
         settled |= clear
@@ -194,7 +202,7 @@ def outward_directions(
         max_pitch_degrees: steepest look direction.
         generator: on the CPU.
     """
-    heading = torch.rand(1, generator=generator).to(up) * 2 * math.pi
+    heading = torch.rand(1, generator=generator, dtype=torch.float32).to(up) * 2 * math.pi
     first, second = _perpendicular(up)
     first, second = heading.cos() * first + heading.sin() * second, heading.cos() * second - heading.sin() * first
     candidates = sphere_directions(_CANDIDATES, like=up) @ torch.stack([first, second, up])
@@ -203,7 +211,7 @@ def outward_directions(
     chosen, need = [], need.clone()
     for center in centers:
         inside = candidates @ F.normalize(surface - center, dim=1).T > math.cos(half_angle_radians)
-        jitter = 0.9 + 0.1 * torch.rand(len(candidates), generator=generator).to(need)
+        jitter = 0.9 + 0.1 * torch.rand(len(candidates), generator=generator, dtype=torch.float32).to(need)
         best = int(((inside.to(need) @ need) * jitter).argmax())
         chosen.append(candidates[best])
         need = torch.where(inside[best], need * _SEEN_AGAIN, need)
@@ -218,7 +226,7 @@ def inward_targets(
     Targets fill a cylinder of radius ``spread`` times the capture's radius, half as high.
     """
     tries = 16
-    draws = torch.rand(len(centers), tries, 3, generator=generator).to(centers)
+    draws = torch.rand(len(centers), tries, 3, generator=generator, dtype=torch.float32).to(centers)
     angle, height = draws[..., 0] * 2 * math.pi, (draws[..., 2] - 0.5) * spread * shape.radius
     distance = draws[..., 1].sqrt() * spread * shape.radius
     first, second = _perpendicular(shape.up)
@@ -237,11 +245,11 @@ def spread_subset(cameras: list[Pinholes], count: int) -> list[int]:
     The first is the camera that is held most level and upright, because the model's canonical frame stands upright in
     the first view. Distances are in units of the capture's extent; looking the opposite way counts like that extent.
     """
-    poses = _poses(cameras)
+    poses = _poses(cameras).double()
     centers, forward = poses[:, :, 3], poses[:, :, 2]
     extent = float((centers - centers.mean(dim=0)).norm(dim=1).max())
     features = torch.cat([(centers - centers.mean(dim=0)) / max(extent, 1e-9), forward / 2], dim=1)
-    chosen = [int((-poses[:, :, 1] @ up_of(cameras)).argmax())]
+    chosen = [int((-poses[:, :, 1] @ _up(poses)).argmax())]
     distance = (features - features[chosen[0]]).norm(dim=1)
     distance[chosen[0]] = -1.0
     while len(chosen) < min(count, len(poses)):
@@ -269,14 +277,14 @@ def _poses(cameras: list[Pinholes]) -> Float[Tensor, "n 3 4"]:
 
 def _focus(centers: Float[Tensor, "n 3"], forward: Float[Tensor, "n 3"]) -> Float[Tensor, "3"] | None:
     """The point nearest to all optical axes, or None when the cameras do not surround and face one."""
-    axes, places = forward.double(), centers.double()
-    across = torch.eye(3, dtype=torch.float64, device=centers.device) - axes[:, :, None] * axes[:, None, :]
+    across = torch.eye(3).to(forward) - forward[:, :, None] * forward[:, None, :]
     total = across.mean(dim=0)
     if float(torch.linalg.eigvalsh(total)[0]) < _CONVERGING:
         return None
-    focus = torch.linalg.solve(total, (across @ places[:, :, None]).mean(dim=0)[:, 0])
-    facing = (F.normalize(focus - places, dim=1) * axes).sum(dim=1) > _FACING_COSINE
-    return focus.to(centers) if float(facing.double().mean()) >= _FACING_SHARE else None
+    middle = centers.mean(dim=0)
+    focus = middle + torch.linalg.solve(total, (across @ (centers - middle)[:, :, None]).mean(dim=0)[:, 0])
+    facing = (F.normalize(focus - centers, dim=1) * forward).sum(dim=1) > _FACING_COSINE
+    return focus if float(facing.double().mean()) >= _FACING_SHARE else None
 
 
 def _perpendicular(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

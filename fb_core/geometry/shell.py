@@ -88,7 +88,7 @@ def fit_shell(
         return sphere(center, fallback_radius)
     if len(distance) < fewest_points:
         return sphere(center, float(distance.median()))
-    keep = torch.linspace(0, len(distance) - 1, min(len(distance), _FIT_POINTS), device=points.device).long()
+    keep = torch.linspace(0, len(distance) - 1, min(len(distance), _FIT_POINTS), device=points.device, dtype=torch.float64).long()
     offset, distance = offset[keep], distance[keep]
     log_distance = distance.log()
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 
-_ONE_PLACE = 1e-6  # of the largest coordinate: spread that float32 cannot tell from none
+_ONE_PLACE = 1e-6  # units of spread that count as none, beside the rounding of the coordinates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +37,12 @@ class Similarity:
         Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is the one given.
         """
         (rotations, centers), (their_rotations, their_centers) = first, second
+        rounding = rounding_of(centers)
         rotations, centers, their_rotations, their_centers = (x.double() for x in (rotations, centers, their_rotations, their_centers))
         rotation = nearest_rotations(torch.einsum("nij,nkj->ik", their_rotations, rotations)[None])[0]
         spread, their_spread = centers - centers.mean(dim=0), (their_centers - their_centers.mean(dim=0)) @ rotation
         scale = scale_of_one_place
-        if float(spread.abs().max()) > _ONE_PLACE * (1.0 + float(centers.abs().max())):
+        if float(spread.abs().max()) > _ONE_PLACE + rounding:
             scale = float((spread * their_spread).sum() / spread.square().sum())
         shift = their_centers.mean(dim=0) - scale * rotation @ centers.mean(dim=0)
         return Similarity(rotation=rotation, scale=scale, shift=shift)
@@ -60,6 +61,11 @@ class Similarity:
         rotations = nearest_rotations(self.rotation @ cameras.rotations.double())
         poses = torch.cat([rotations, self.points(cameras.centers)[:, :, None]], dim=2)
         return dataclasses.replace(cameras.to(torch.float64), camera_to_world=poses)
+
+
+def rounding_of(places: Float[Tensor, "n 3"]) -> float:
+    """What the precision that places are told in may have moved them by, scene units."""
+    return 8 * torch.finfo(places.dtype).eps * float(places.abs().max())
 
 
 def nearest_rotations(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fb_core.geometry.distances import distances_between
+from fb_core.geometry.paths import distances
 
 _NEIGHBOURS = 6  # photos that each photo is matched with
 _EPIPOLAR_DEGREES = 0.25  # a match lies this near the plane through both centres and the other ray
@@ -92,17 +92,20 @@ def triangulate(photos: Sequence[Features]) -> tuple[Float[Tensor, "m 3"], Float
     owner = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(photo) for photo in photos]))
     members = track >= 0
     track, owner = track[members], owner[members]
-    centers = torch.stack([photo.center for photo in photos]).double()[owner]
+    places = torch.stack([photo.center for photo in photos]).double()
+    middle = places.mean(dim=0)
+    centers = (places - middle)[owner]
     directions = torch.cat([photo.directions for photo in photos]).double()[members]
     points, good = nearest_points(centers, directions, track)
+    points = points + middle
     colors = _mean_over(torch.cat([photo.colors for photo in photos])[members].double(), track, len(points))
-    return points[good].float(), colors[good].float()
+    return points[good].to(photos[0].center), colors[good].float()
 
 
 def matches(first: Features, second: Features) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """Indices of features that are each other's best match near their epipolar planes, and clearly better than the next one."""
     nothing = torch.zeros(0, dtype=torch.long)
-    baseline = second.center - first.center
+    baseline = (second.center - first.center).to(first.directions)
     if len(first) < 2 or len(second) < 2 or float(baseline.norm()) == 0:
         return nothing, nothing
     # The angle between a ray and the plane through the baseline and the other photo's ray.
@@ -160,8 +163,10 @@ def nearest_points(
 def _pairs(photos: Sequence[Features]) -> list[tuple[int, int]]:
     """Each photo with those that look most the same way from another place."""
     centers = torch.stack([photo.center for photo in photos])
-    looks = torch.stack([F.normalize(photo.directions.sum(dim=0), dim=0) if len(photo) else torch.zeros(3) for photo in photos])
-    apart = distances_between(centers.double(), centers.double())
+    looks = torch.stack(
+        [F.normalize(photo.directions.sum(dim=0), dim=0) if len(photo) else photo.directions.new_zeros(3) for photo in photos]
+    )
+    apart = distances(centers, centers)
     typical = apart[apart > 0].median() if bool((apart > 0).any()) else torch.ones(())
     closeness = (looks @ looks.T).double() - 0.2 * apart / typical
     closeness[apart <= 1e-9 * typical] = -torch.inf
