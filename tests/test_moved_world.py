@@ -146,7 +146,7 @@ def test_ellipse_and_cameras_in_one_place(far) -> None:
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
 @pytest.mark.parametrize("inward", [False, True])
 def test_shell_its_rays_and_what_is_seen(dtype, far, inward) -> None:
-    here, there, shift, rounding = worlds(dtype, far, inward=inward)
+    here, there, shift, _ = worlds(dtype, far, inward=inward)
     points, center = walls(), torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     one = fit_shell(points.to(dtype), center=center.to(dtype), fallback_radius=1.0, up=UP.to(dtype))
     two = fit_shell((points + shift).to(dtype), center=(center + shift).to(dtype), fallback_radius=1.0, up=UP.to(dtype))
@@ -213,7 +213,7 @@ def bank(cameras: Pinholes) -> CompletedViews:
 
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
 def test_what_is_unseen(dtype, far) -> None:
-    here, there, shift, rounding = worlds(dtype, far)
+    here, there, shift, _ = worlds(dtype, far)
     answers = []
     for cameras, by in ((here, 0 * shift), (there, shift)):
         shell = fit_shell(walls() + by, center=torch.zeros(3, dtype=torch.float64) + by, fallback_radius=1.0, up=UP)

@@ -119,7 +119,7 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
 
 
 def _centred(cameras: list[Pinholes]) -> tuple[list[Pinholes], Float[Tensor, "3"]]:
-    """The cameras in float64 about their middle, and where that was: what is reckoned there does not depend on where the world's origin is."""
+    """The cameras in float64 about their middle, and where that was: what is reckoned there knows nothing of the world's origin."""
     exact = [one.to(torch.float64) for one in cameras]
     middle = torch.cat([one.centers for one in exact]).mean(dim=0) if exact else torch.zeros(3, dtype=torch.float64)
     return [_moved(one, -middle) for one in exact], middle
