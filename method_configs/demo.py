@@ -108,7 +108,7 @@ def training_arguments(output: Path, method: str, *, seed: int, iterations: int,
 def _train_both(output: Path, *, seed: int, iterations: int, model: Path | None, bars: _Bars) -> dict[str, float]:
     """Run both trainings at once, each on half of the cores; returns the seconds of their stages."""
     threads = max(1, usable_cores() // 2)
-    (output / "runs").mkdir()
+    (output / "runs").mkdir(exist_ok=True)  # logs of an earlier demo that failed may lie there
     started: dict[str, TrainingProcess] = {}
     try:
         for name, method in METHODS.items():
