@@ -162,7 +162,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         completion = self.config.completion
         if not completion.enabled or self._finished or step < completion.at_step:
             return
-        with own_randomness(self.device):
+        with own_randomness(self.device, seed=completion.seed, step=step):
             self._complete(attributes, step)
 
     def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
@@ -241,7 +241,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         if isinstance(request, RegenerateRound):
             self._outdated = [number for number in self._outdated if number != request.number]
         try:
-            with own_randomness(self.device):
+            with own_randomness(self.device, seed=self.config.completion.seed, step=step):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"

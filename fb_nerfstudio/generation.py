@@ -12,6 +12,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from fb_core.sampling.randomness import mixed
 from fb_nerfstudio.completed_views import round_title
 from fb_nerfstudio.completion import CapturedView
 from fb_nerfstudio.completion_plan import PlannedRound
@@ -84,10 +85,14 @@ class Bars:
 
 
 @contextmanager
-def own_randomness(device: torch.device | str) -> Iterator[None]:
-    """Leaves torch's global random state as it was: training goes on as if nothing had been generated."""
+def own_randomness(device: torch.device | str, *, seed: int, step: int) -> Iterator[None]:
+    """Draws from torch's global state that ``seed`` and ``step`` alone decide, whatever happened before, as after a kill.
+
+    Leaves that state as it was: training goes on as if nothing had been generated.
+    """
     device = torch.device(device)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(mixed(seed, step))
         yield
 
 

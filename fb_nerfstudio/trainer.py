@@ -41,6 +41,7 @@ class FillerbusterTrainerConfig(TrainerConfig):
         A second signal ends it at once, whatever is still being cleaned up: files are whole or absent, and the rest is cleaned up later.
         """
         signal.signal(number, signal.SIG_DFL)
+        self.logging.profiler = "none"  # nerfstudio would print its table below
         checkpoints = self.get_checkpoint_dir() if any(self.get_checkpoint_dir().glob("step-*.ckpt")) else self.load_dir
         advice = "nothing was saved yet" if checkpoints is None else f"go on with --load-dir {checkpoints}"
         sys.stderr.write(f"\nStopped; {advice}.\n")

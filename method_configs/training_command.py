@@ -23,6 +23,7 @@ from fb_core.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.training.distributed import Group, joined
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.loop import EngineConfig, OnProgress
+from fb_core.training.progress_log import ProgressLog
 from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
 from method_configs.ablations import PRESETS
 
@@ -107,6 +108,8 @@ def _train_stages(
     for name in stages:
         if _steps_done(output / name) >= (steps or _steps_planned(recipe, name)):
             _say(group, "%s is trained already", name)
+            if group.is_main and not (output / name / "loss.png").exists():
+                ProgressLog(output / name, name, from_step=_steps_done(output / name)).close()  # it was ended before its curve was drawn
             continue
         if group.any(time.monotonic() >= until):
             break

@@ -11,6 +11,7 @@ from test_chain import run_ns_train, toy_config
 from tiny_models import save_tiny_model
 
 from fb_core.data.room_captures import rooms
+from fb_nerfstudio.generation import own_randomness
 from fb_nerfstudio.trainer import FillerbusterTrainer
 
 SAVED, LAST = 10, 13
@@ -72,3 +73,16 @@ def test_a_resumed_run_repeats_the_run_that_was_not_interrupted(inputs, tmp_path
         assert same, path
     saved = torch.load(folder / "whole" / f"nerfstudio_models/step-{SAVED:09d}.ckpt", weights_only=True)["pipeline"]
     assert len(saved["_model.gauss_params.means"]) != len(whole["/pipeline/_model.gauss_params.means"]), "nothing was refined"
+
+
+def test_what_a_generation_draws_is_decided_by_seed_and_step_alone():
+    """The turns of placed Gaussians among it: a run that goes on after a kill places the very same ones."""
+    drawn = []
+    for before in (3, 4):
+        torch.manual_seed(before)
+        expected = torch.rand(5, generator=torch.Generator().manual_seed(before))
+        with own_randomness("cpu", seed=7, step=2):
+            drawn.append(torch.rand(5))
+        assert torch.equal(torch.rand(5), expected), "training goes on as if nothing had been drawn"
+    with own_randomness("cpu", seed=7, step=3):
+        assert torch.equal(*drawn) and not torch.equal(drawn[0], torch.rand(5))
