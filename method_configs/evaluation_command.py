@@ -76,6 +76,7 @@ class Rooms:
 
 
 def _draw(path: Path, results: Sequence, known: int, completer) -> None:
+    from fb_core.evaluation.completion import TOLD
     from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
 
     strips = []
