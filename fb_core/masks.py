@@ -85,6 +85,9 @@ def grow_hole(known: Float[Tensor, "n 1 h w"], *, pixels: int) -> Float[Tensor, 
 
 def to_latent_grid(known: Float[Tensor, "n 1 h w"], *, factor: int = 8) -> Float[Tensor, "n 1 lh lw"]:
     """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples of ``factor``."""
+    height, width = known.shape[-2:]
+    if height % factor or width % factor or not height or not width:
+        raise ValueError(f"latent grid: expected a mask whose sides are multiples of {factor} pixels, got {width}x{height}; pad it first")
     return F.avg_pool2d(known, kernel_size=factor)
 
 

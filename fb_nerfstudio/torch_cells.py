@@ -137,7 +137,8 @@ def measure_strips(ellipses: Ellipses, grid: CellGrid) -> Strips:
         over_A=over_A,
         over_yy=(A * determinant).reciprocal_(),
         reach=reach,
-        turn=(reach * determinant / C).sqrt_().mul_(B).neg_(),
+        # Root by root: the product overflows for Gaussians much larger than the picture, and infinity times B = 0 is no number.
+        turn=determinant.sqrt().mul_(B).mul_(C.rsqrt()).mul_(reach.sqrt()).neg_(),
         first_row=first,
         rows=rows.int(),
         cells=(rows * (right - left).clamp_(min=0)).int(),

@@ -143,7 +143,7 @@ def find_unseen(
         wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
         beside = seen_by([_widened(camera) for camera in nearby], flat, wider).reshape(covered.shape)
         inside |= beside & (rendered.accumulation >= FIRM)
-    return Unseen(mask=~(covered & inside), points=points)
+    return Unseen(mask=~(covered & inside), points=points.to(views.cameras.camera_to_world.dtype))
 
 
 def _widened(camera: Pinholes) -> Pinholes:
@@ -199,7 +199,7 @@ def unseen_gaussians(
     images = rearrange(views.images.float() / 255, "n h w c -> n c h w")
     colors = rearrange(F.interpolate(images, size=usable.shape[1:], mode="area"), "n c h w -> n h w c")
     chosen = torch.randperm(int(usable.sum()), generator=generator)[:limit]
-    return unseen.points[usable][chosen].to(colors), colors[usable][chosen]
+    return unseen.points[usable][chosen], colors[usable][chosen]
 
 
 def seen_by_nobody_else(

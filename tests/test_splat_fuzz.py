@@ -193,6 +193,16 @@ def test_coefficients_that_take_no_part_may_hold_anything() -> None:
     assert rasterization(**{**inputs, "colors": inputs["colors"] * math.nan}, sh_degree=1, render_mode="ED")[2]["dropped"] == 0
 
 
+def test_gaussians_of_millions_of_units_cover_the_picture() -> None:
+    """Unturned ones, whose ellipses have no slant: zero times an overflow was no number, and no width of a strip."""
+    inputs: dict[str, Any] = scene(6, dtype=torch.float32)
+    inputs |= {"quats": torch.zeros(6, 4), "scales": inputs["scales"] * 1e8, "opacities": torch.full((6,), 0.4)}
+    images, alphas, _, gradients = rendered(inputs, {"render_mode": "RGB"}, "gradients")
+    drawn = int((rasterization(**inputs)[2]["radii"] > 0).sum())
+    assert drawn >= 2 and torch.allclose(alphas, torch.full_like(alphas, 1 - 0.6**drawn), atol=1e-5)
+    assert bool(images.isfinite().all()) and all(bool(gradient.isfinite().all()) for gradient in gradients.values())
+
+
 @pytest.mark.parametrize("name", ["viewmats", "Ks", "backgrounds"])
 def test_a_camera_that_is_not_finite_is_refused(name: str) -> None:
     inputs: dict[str, Any] = scene(7, dtype=torch.float32) | {"backgrounds": torch.zeros(1, 3)}

@@ -57,6 +57,8 @@ class Ellipse:
         line get a narrow ellipse along it, level across; centres in one place get that place.
         """
         places = centers.double()
+        if not len(places) or not bool(torch.isfinite(places).all()):
+            raise ValueError("ellipse: expected one or more finite camera centres, got none or one that holds NaN or infinity")
         middle = places.mean(dim=0)
         _, spread, axes = torch.linalg.svd(places - middle, full_matrices=True)
         deviation = F.pad(spread, (0, 3 - len(spread))) / math.sqrt(len(places))
@@ -119,7 +121,7 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
 
 
 def _centred(cameras: list[Pinholes]) -> tuple[list[Pinholes], Float[Tensor, "3"]]:
-    """The cameras in float64 about their middle, and where that was: what is reckoned there knows nothing of the world's origin."""
+    """The cameras in float64 about their middle, and where that was: near the origin the world's place costs no digits."""
     exact = [one.to(torch.float64) for one in cameras]
     middle = torch.cat([one.centers for one in exact]).mean(dim=0) if exact else torch.zeros(3, dtype=torch.float64)
     return [_moved(one, -middle) for one in exact], middle

@@ -27,6 +27,10 @@ class Pinholes:
     height: int
     """Image height in pixels."""
 
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"cameras: expected pictures of at least 1x1 pixels, got {self.width}x{self.height}")
+
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
 
@@ -142,6 +146,8 @@ class Pinholes:
         """
         if not 0.0 < fov_degrees < 180.0:
             raise ValueError(f"looking_at: expected fov_degrees between 0 and 180, got {fov_degrees}")
+        if width < 1 or height < 1:
+            raise ValueError(f"looking_at: expected pictures of at least 1x1 pixels, got {width}x{height}")
         toward = targets.double() - centers.double()
         distance = toward.norm(dim=-1, keepdim=True)
         if not bool((distance > 0).all() and torch.isfinite(distance).all()):

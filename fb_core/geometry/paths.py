@@ -105,6 +105,8 @@ def cylinder_centers(
         half_height: heights lie between minus and plus this about the centre.
         levels: number of equally spaced heights; one level is at the centre's height.
     """
+    if count < 0:
+        raise ValueError(f"cylinder_centers: expected a count of 0 or more, got {count}")
     like = {"device": shape.center.device, "dtype": shape.center.dtype}
     heading, draws = (torch.rand(number, generator=generator, dtype=torch.float32) for number in (1, count))
     angle = ((torch.arange(count) / max(count, 1) + heading) * 2 * math.pi).to(**like)
@@ -131,6 +133,8 @@ def kept_clear(
     """
     if len(centers) == 0:
         return centers
+    if len(refuges) == 0:
+        raise ValueError("kept_clear: expected at least one captured place to withdraw to, got none; pass the captured cameras' centres")
     home = refuges[distances(centers, refuges).argmin(dim=1)]
     result, settled = home.clone(), torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
     for eighth in range(8):
@@ -170,6 +174,8 @@ def seen_by(
 
 def sphere_directions(count: int, *, like: Tensor) -> Float[Tensor, "n 3"]:
     """Unit directions that are nearly equally spaced (a Fibonacci lattice about z)."""
+    if count < 0:
+        raise ValueError(f"sphere_directions: expected a count of 0 or more, got {count}")
     index = torch.arange(count, device=like.device, dtype=like.dtype) + 0.5
     z = 1 - 2 * index / count
     angle = index * (math.pi * (3 - math.sqrt(5)))
@@ -202,11 +208,13 @@ def outward_directions(
         max_pitch_degrees: steepest look direction.
         generator: on the CPU.
     """
+    if not 0 <= max_pitch_degrees <= 90:
+        raise ValueError(f"outward_directions: expected max_pitch_degrees from 0 to 90, got {max_pitch_degrees}")
     heading = torch.rand(1, generator=generator, dtype=torch.float32).to(up) * 2 * math.pi
     first, second = _perpendicular(up)
     first, second = heading.cos() * first + heading.sin() * second, heading.cos() * second - heading.sin() * first
     candidates = sphere_directions(_CANDIDATES, like=up) @ torch.stack([first, second, up])
-    steepest = math.sin(math.radians(max_pitch_degrees)) + 1 / _CANDIDATES  # keeps the middle row for a limit of 0
+    steepest = math.sin(math.radians(max_pitch_degrees)) + 1.001 / _CANDIDATES  # keeps the middle rows, at 1, for a limit of 0
     candidates = candidates[(candidates @ up).abs() <= steepest]
     chosen, need = [], need.clone()
     for center in centers:
@@ -261,6 +269,8 @@ def spread_subset(cameras: list[Pinholes], count: int) -> list[int]:
 
 def strided_subset(total: int, count: int) -> list[int]:
     """``count`` equally spaced indices from first to last without repetition, all when there are fewer (the paper's choice)."""
+    if count < 0:
+        raise ValueError(f"strided_subset: expected a count of 0 or more, got {count}")
     if count >= total:
         return list(range(total))
     return torch.linspace(0, total - 1, count).round().long().tolist()

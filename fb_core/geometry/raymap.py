@@ -55,6 +55,13 @@ def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
     return torch.stack([right, down, torch.linalg.cross(right, down)], dim=1).to(directions.dtype)
 
 
+def _check_reference(reference: int, count: int) -> None:
+    if count == 0:
+        raise ValueError("canonical frame: expected at least one camera, got none; pass the captured cameras")
+    if not -count <= reference < count:
+        raise ValueError(f"canonical frame: expected a reference among {count} cameras, got number {reference}")
+
+
 def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """Files hold rounded rotations, but only a true one makes a frame with an exact inverse. Refuses what is no rotation at all."""
     error = float((matrix.T @ matrix - torch.eye(3, dtype=matrix.dtype)).abs().max())
@@ -87,8 +94,7 @@ class CanonicalFrame:
             heading_radians: rotation about the canonical z axis (training draws it, inference uses 0).
             fill: for captures that already fit into the cube: 1 fills the cube, 0 leaves the scale alone (training draws it).
         """
-        if len(cameras) == 0:
-            raise ValueError("canonical frame: expected at least one camera, got none; pass the captured cameras")
+        _check_reference(reference, len(cameras))
         return CanonicalFrame.around(
             cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians=heading_radians, fill=fill
         )
@@ -98,6 +104,7 @@ class CanonicalFrame:
         raymaps: Float[Tensor, "n 6 h w"], *, reference: int = 0, heading_radians: float = 0.0, fill: float = 1.0
     ) -> CanonicalFrame:
         """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
+        _check_reference(reference, len(raymaps))
         rotation = axes_of(raymaps[reference, 3:])
         centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
         return CanonicalFrame.around(rotation, centers[reference], centers, heading_radians=heading_radians, fill=fill)

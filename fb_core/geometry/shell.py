@@ -36,7 +36,8 @@ class Shell:
         rows, columns = self.log_radius.shape
         row = torch.acos(directions[:, 2].clamp(-1.0, 1.0)) / math.pi * (rows - 1)
         column = torch.atan2(directions[:, 1], directions[:, 0]) / (2 * math.pi) * columns
-        top, left = row.floor().clamp(0, rows - 2), column.floor()
+        # A direction that is not a number has no radius, but must not become an index.
+        top, left = row.nan_to_num(0.0).floor().clamp(0, rows - 2), column.nan_to_num(0.0).floor()
         down, along = row - top, column - left
         top, left = top.long(), left.long() % columns
         right = (left + 1) % columns
@@ -80,6 +81,8 @@ def fit_shell(
         bandwidth_degrees: angular smoothing.
         fewest_points: with fewer usable points the result is a sphere at their median distance.
     """
+    if not 0 < bandwidth_degrees < math.inf:
+        raise ValueError(f"shell: bandwidth_degrees must be a positive finite number, got {bandwidth_degrees}")
     offset = points[torch.isfinite(points).all(dim=1)] - center
     distance = offset.norm(dim=1)
     usable = distance > 1e-9 * (1 + float(distance.max()) if len(distance) else 1.0)
@@ -116,6 +119,8 @@ def intersect(shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Ten
         directions: unit ray directions.
         samples: marching steps per ray; features thinner than (shell size / samples) may be jumped over.
     """
+    if samples < 1:
+        raise ValueError(f"shell: expected at least one marching step per ray, got {samples}")
     start = origins - shell.center
 
     def outside(distance: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:

@@ -37,6 +37,8 @@ class Similarity:
         Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is the one given.
         """
         (rotations, centers), (their_rotations, their_centers) = first, second
+        if not len(centers) or not all(bool(torch.isfinite(one).all()) for pair in (first, second) for one in pair):
+            raise ValueError("similarity: expected the poses of one or more cameras, got none or one that holds NaN or infinity")
         rounding = rounding_of(centers)
         rotations, centers, their_rotations, their_centers = (x.double() for x in (rotations, centers, their_rotations, their_centers))
         rotation = nearest_rotations(torch.einsum("nij,nkj->ik", their_rotations, rotations)[None])[0]

@@ -163,9 +163,7 @@ def nearest_points(
 def _pairs(photos: Sequence[Features]) -> list[tuple[int, int]]:
     """Each photo with those that look most the same way from another place."""
     centers = torch.stack([photo.center for photo in photos])
-    looks = torch.stack(
-        [F.normalize(photo.directions.sum(dim=0), dim=0) if len(photo) else photo.directions.new_zeros(3) for photo in photos]
-    )
+    looks = torch.stack([F.normalize(photo.directions.sum(dim=0), dim=0) for photo in photos])  # zero where a photo has none
     apart = distances(centers, centers)
     typical = apart[apart > 0].median() if bool((apart > 0).any()) else torch.ones(())
     closeness = (looks @ looks.T).double() - 0.2 * apart / typical
