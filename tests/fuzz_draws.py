@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 
-FAST, ALL = 40, 420
+FAST, ALL = 150, 600
 """Draws of each case in the suite, and in the whole fuzz."""
 
 

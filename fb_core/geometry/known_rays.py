@@ -23,6 +23,8 @@ def frame_of_known_rays(raymaps: Float[Tensor, "n 6 h w"], known: Float[Tensor, 
     if not posed:
         return None
     rays = [raymaps[view].detach().cpu()[:, there[view]] for view in posed]
+    if not all(bool(torch.isfinite(one).all()) for one in rays):
+        raise ValueError("canonical frame: a known ray holds NaN or infinity; expected finite numbers, or mark the ray as unknown")
     centers = torch.stack([one[:3].double().mean(dim=1) for one in rays]).to(raymaps.dtype)
     for place, view in enumerate(posed):
         whole = bool(there[view].all()) and min(there[view].shape) > 1
