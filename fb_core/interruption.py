@@ -1,7 +1,7 @@
 """Ctrl-C and SIGTERM, told to a program when it can stand them: never in the middle of an import.
 
-Python raises KeyboardInterrupt wherever the main thread happens to be. Inside an import that is no place to be left: modules swallow it
-in an ``except:`` around an optional dependency, so that the command goes on, or leave a C extension half set up, which is a crash later.
+Python raises KeyboardInterrupt wherever the main thread happens to be. An import is no place to be left: modules swallow it
+in an ``except:`` around an optional dependency, so that the command goes on, or stay half set up, which is a crash later.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LATER_SECONDS = 0.05
 
 
 def raise_interrupt(number: int) -> NoReturn:
-    """KeyboardInterrupt for Ctrl-C; SystemExit(128 + number) for another signal, so that children are ended on the way out."""
+    """KeyboardInterrupt for Ctrl-C; SystemExit(128 + number) for others, so that children are ended on the way out."""
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     raise SystemExit(128 + number)
@@ -28,8 +28,8 @@ def raise_interrupt(number: int) -> NoReturn:
 def stop_on_signals(stop: Callable[[int], NoReturn] = raise_interrupt) -> None:
     """From now on ``stop(number)``, which raises, is called in the main thread for SIGINT and SIGTERM.
 
-    A signal that comes during an import waits for the end of it, and one whose error was lost in a place from where Python cannot raise
-    (a destructor, a callback of C code) comes again. Does nothing outside the main thread, where Python sets no handlers.
+    A signal that comes during an import waits for the end of it, and one whose error was lost in a place from where Python
+    cannot raise (a destructor, a callback of C code) comes again. Outside the main thread Python sets no handlers, nor does this.
     """
     if threading.current_thread() is not threading.main_thread():
         return

@@ -86,7 +86,7 @@ class Bars:
 
 @contextmanager
 def own_randomness(device: torch.device | str, *, seed: int, step: int) -> Iterator[None]:
-    """Draws from torch's global state that ``seed`` and ``step`` alone decide, whatever happened before, as after a kill.
+    """Draws from torch's global state that ``seed`` and ``step`` alone decide, whatever happened before, a kill even.
 
     Leaves that state as it was: training goes on as if nothing had been generated.
     """

@@ -36,9 +36,9 @@ class FillerbusterTrainerConfig(TrainerConfig):
         super().set_timestamp()
 
     def _stop(self, number: int) -> NoReturn:
-        """Ends the command with one line. A SystemExit: nerfstudio would print KeyboardInterrupt's traceback and report success.
+        """Ends the command with one line. A SystemExit: nerfstudio answers KeyboardInterrupt with a traceback and success.
 
-        A second signal ends it at once, whatever is still being cleaned up: files are whole or absent, and the rest is cleaned up later.
+        A second signal ends it at once, whatever is still being cleaned up: files are whole or absent in any case.
         """
         signal.signal(number, signal.SIG_DFL)
         self.logging.profiler = "none"  # nerfstudio would print its table below

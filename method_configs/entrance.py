@@ -28,7 +28,7 @@ def main() -> None:
         sys.stderr.write("Stopped.\n")
         sys.exit(ENDED_BY_USER)
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is done or undone; what is left to interrupt is Python's own end
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # only Python's own end is left to interrupt
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def _train_stages(
         if _steps_done(output / name) >= (steps or _steps_planned(recipe, name)):
             _say(group, "%s is trained already", name)
             if group.is_main and not (output / name / "loss.png").exists():
-                ProgressLog(output / name, name, from_step=_steps_done(output / name)).close()  # it was ended before its curve was drawn
+                ProgressLog(output / name, name, from_step=_steps_done(output / name)).close()  # killed before it was drawn
             continue
         if group.any(time.monotonic() >= until):
             break

@@ -1,7 +1,8 @@
-"""Real processes at the price of a fork: a server imports everything once, and each command runs, and is killed, in a child of its own.
+"""Real processes at the price of a fork: a server imports everything once, and each command runs and is killed in a child.
 
-The child goes the way of the console script from its first line to the interpreter's end. What it does to files is counted by Python's own
-audit events (opened for writing, made, renamed, removed), and at the N-th of them it can send itself a signal: the product has no hook.
+The child goes the way of the console script from its first line to the interpreter's end. What it does to files is counted by
+Python's own audit events (opened for writing, made, renamed, removed), and at the N-th of them it can send itself a signal: the
+product has no hook.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 HERE = Path(__file__).parent
 _CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.truncate", "os.symlink"}
 _PATIENCE_SECONDS = 240.0
-_NO_FAULT = "nanobind:"  # begins what libraries say at the end of a process whose objects are frozen for the sake of its forks
+_NO_FAULT = "nanobind:"  # begins what a library says at the end of a process whose objects are frozen
 GENERATED = "a round was generated"
 """What a child of `_ns_train` says after each."""
 
@@ -69,7 +70,7 @@ class ForkServer:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
     def run(self, job: dict[str, Any], *, watch: Path, moment: Moment | None = None) -> Ended:
-        """Run a command (``argv`` of fillerbuster, or options of `_ns_train`) in the folder ``watch``, whose changes are counted."""
+        """Run a command (``argv``, or options of `_ns_train`) in the folder ``watch``, whose changes are counted."""
         assert self._process.stdin is not None and self._process.stdout is not None
         asked = {} if moment is None else {"signal": int(moment.signal), "event": moment.event, "after": moment.after}
         log = self._scratch / "log"
@@ -160,7 +161,7 @@ def _waited(child: int, job: dict[str, Any], began: float) -> int:
 
 
 def _become(job: dict[str, Any], writer: int) -> None:
-    """Turn a fork of the server into a process that has just begun: its own files, signals and folder; and count its changes."""
+    """Turn a fork of the server into a process that has just begun, with files and signals of its own; count its changes."""
     log = os.open(job["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     nothing = os.open(os.devnull, os.O_RDONLY)
     for descriptor, target in ((nothing, 0), (log, 1), (log, 2)):
@@ -185,13 +186,13 @@ def _become(job: dict[str, Any], writer: int) -> None:
 
 
 def _is_change(event: str, arguments: tuple[Any, ...], folder: str) -> bool:
-    """Whether an audit event is a change of a file below the folder (files named relative to a descriptor are taken to be)."""
+    """Whether an audit event is a change of a file below the folder (so are files named relative to a descriptor)."""
     if event == "ctypes.dlsym":
         return arguments[1] == "renameat2"
     if event == "open":
         path, mode, flags = arguments
-        writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)) if isinstance(flags, int) else bool(set(mode or "") & set("wax+"))
-        if not writes:
+        known = isinstance(flags, int)
+        if not (flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) if known else set(mode or "") & set("wax+")):
             return False
     elif event in _CHANGES:
         path = arguments[0]
@@ -204,7 +205,7 @@ def _is_change(event: str, arguments: tuple[Any, ...], folder: str) -> bool:
 
 
 def _ns_train(options: dict[str, Any]) -> None:
-    """What ``ns-train`` does once its command line is read: anchors and two more rounds in the middle of a few steps."""
+    """What ``ns-train`` does once its command line is read: anchors and two more rounds amid a few steps."""
     from killed_training import kill_config
     from test_chain import run_ns_train
 

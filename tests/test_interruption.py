@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM where Python could not stand them: inside imports, in destructors, twice, and in nerfstudio's own main function."""
+"""Ctrl-C and SIGTERM where Python cannot stand them: inside imports, in destructors, twice, and in nerfstudio's launch."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def test_a_training_notes_ctrl_c_once_and_obeys_it_twice():
 
 
 @pytest.mark.parametrize("saved", [None, "own", "given"])
-def test_nerfstudio_ends_with_a_code_and_says_where_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], saved: str | None):
-    """Its main function turns KeyboardInterrupt into a traceback and success, so what it sees is the end of the program."""
+def test_nerfstudio_ends_with_a_code_and_says_where_to_go_on(tmp_path: Path, capsys, saved: str | None):
+    """It turns KeyboardInterrupt into a traceback and success, so what it sees is the end of the program."""
     from nerfstudio.scripts import train as ns_train
 
     from method_configs.splats import fillerbuster
