@@ -8,7 +8,7 @@ from typing import Any
 
 MOST_BYTES = 2**27
 """Of a file; a hundred thousand cameras take about half of it."""
-_MOST_DIGITS = 18  # of an integer that a program would store as one
+_MOST_DIGITS = 20  # of an integer that 64 bits may hold, its sign included
 
 
 def read_json(path: Path, *, most_bytes: int = MOST_BYTES) -> Any:
@@ -34,4 +34,5 @@ def parse_json(text: bytes) -> Any:
 
 
 def _integer(digits: str) -> int | float:
-    return int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
+    number = int(digits) if len(digits) <= _MOST_DIGITS else float(digits)
+    return number if -(2**63) <= number < 2**64 else float(number)

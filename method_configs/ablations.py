@@ -54,6 +54,7 @@ ROOMS_ABLATION = dataclasses.replace(
     pool=dataclasses.replace(ROOMS_TINY.pool, rooms=200, views=12, renewed_per_step=0.0),
     dit_loop=dataclasses.replace(ROOMS_TINY.dit_loop, steps=400, learning_rate=2e-3),
     sampling=dataclasses.replace(ROOMS_TINY.sampling, steps=4, guess="start"),
+    engine=EngineConfig(),  # float32: the same table on every machine
     # The tasks are the paper's, unlike those of rooms-tiny: the designs differ in how raymaps count.
     dit_loss=dataclasses.replace(
         ROOMS_TINY.dit_loss,
