@@ -126,24 +126,31 @@ def find_unseen(
         rendered: the splats from the views' cameras made coarse, or None while they are untrained.
         known: of each captured picture :func:`coarse_mask`; without, all of them are known.
     """
-    cameras = coarse(views.cameras).to(torch.float64)  # a scene may lie far from the origin
+    origin = shell.center.to("cpu", torch.float64)
+    cameras = _about(coarse(views.cameras), origin)
     directions = cameras.directions()
     origins = cameras.centers[:, None, None].expand_as(directions)
-    distance = intersect(shell, origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
+    around = Shell(center=torch.zeros(3).to(origins), log_radius=shell.log_radius.to(origins))
+    distance = intersect(around, origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
     points = origins + distance[..., None] * directions
     far = distance.nan_to_num(posinf=1e6 * float(shell.log_radius.max().exp()))
     surface, covered = origins + far[..., None] * directions, torch.ones_like(distance, dtype=torch.bool)
     if rendered is not None:
         covered = rendered.solid
-        surface = torch.where(covered[..., None], cameras.unproject(rendered.depth.double()), surface)
+        surface = torch.where(covered[..., None], cameras.unproject(rendered.depth), surface)
     flat = surface.reshape(-1, 3)
-    nearby = [camera.to("cpu", torch.float64) for camera in captured]
+    nearby = [_about(camera, origin) for camera in captured]
     inside = seen_by(nearby, flat, known).reshape(covered.shape)
     if rendered is not None:
         wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
         beside = seen_by([_widened(camera) for camera in nearby], flat, wider).reshape(covered.shape)
         inside |= beside & (rendered.accumulation >= FIRM)
-    return Unseen(mask=~(covered & inside), points=points.to(views.cameras.camera_to_world.dtype))
+    return Unseen(mask=~(covered & inside), points=(points + origin).to(views.cameras.camera_to_world.dtype))
+
+
+def _about(cameras: Pinholes, origin: Float[Tensor, "3"]) -> Pinholes:
+    """The cameras on the CPU, their places counted from a point near them, which is exact however far off the world's origin is."""
+    return cameras.to("cpu", torch.float64).moved(-origin).to(torch.float32)
 
 
 def _widened(camera: Pinholes) -> Pinholes:

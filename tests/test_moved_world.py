@@ -73,11 +73,6 @@ def walls(count: int = 900) -> Tensor:
     return on_lattice(points[points[:, 0] > 0])
 
 
-def shifted(cameras: Pinholes, shift: Tensor) -> Pinholes:
-    poses = torch.cat([cameras.rotations, (cameras.centers + shift)[:, :, None]], dim=2)
-    return dataclasses.replace(cameras, camera_to_world=poses)
-
-
 def single(cameras: Pinholes) -> list[Pinholes]:
     return [cameras[index] for index in range(len(cameras))]
 
@@ -85,7 +80,7 @@ def single(cameras: Pinholes) -> list[Pinholes]:
 def worlds(dtype: torch.dtype, far: float, **options) -> tuple[Pinholes, Pinholes, Tensor, float]:
     """A capture, the same elsewhere, how far, and what rounding may do to a place there."""
     cameras, shift = room(**options), away(far)
-    return cameras.to(dtype), shifted(cameras, shift).to(dtype), shift, 4 * torch.finfo(dtype).eps * far + 1e-6
+    return cameras.to(dtype), cameras.moved(shift).to(dtype), shift, 4 * torch.finfo(dtype).eps * far + 1e-6
 
 
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
@@ -140,7 +135,7 @@ def test_ellipse_and_cameras_in_one_place(far) -> None:
     place = centers[:1].expand(8, 3)
     for kind in PATHS:
         still = dataclasses.replace(room(8), camera_to_world=torch.cat([room(8).rotations, place[:, :, None]], dim=2))
-        one, two = (path_cameras(kind, [cameras], 5, size=32) for cameras in (still, shifted(still, shift)))
+        one, two = (path_cameras(kind, [cameras], 5, size=32) for cameras in (still, still.moved(shift)))
         assert torch.allclose(one.rotations, two.rotations, atol=1e-6)
 
 
@@ -219,7 +214,7 @@ def test_what_is_unseen(dtype, far) -> None:
     for cameras, by in ((here, 0 * shift), (there, shift)):
         shell = fit_shell(walls() + by, center=torch.zeros(3, dtype=torch.float64) + by, fallback_radius=1.0, up=UP)
         views = bank(cameras[[0, 3, 5]].to(torch.float32))
-        new = dataclasses.replace(views, cameras=shifted(views.cameras, torch.tensor([1.0, 0.0, 0.0])))
+        new = dataclasses.replace(views, cameras=views.cameras.moved(torch.tensor([1.0, 0.0, 0.0])))
         unseen = find_unseen(new, single(cameras[:2]), shell, None)
         alone = seen_by_nobody_else((walls() + by).to(dtype), views[[0, 1]], views[[2]], single(cameras[:2]))
         answers.append((unseen.mask, unseen.points.double() - by, alone))

@@ -6,7 +6,6 @@ All of them are closed curves or windings about one axis, walked at even speed, 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -117,19 +116,14 @@ def path_cameras(kind: str, cameras: list[Pinholes], count: int, *, size: int, f
         width=size,
         height=size,
     )
-    return _moved(new, origin).to(given)
+    return new.moved(origin).to(given)
 
 
 def _centred(cameras: list[Pinholes]) -> tuple[list[Pinholes], Float[Tensor, "3"]]:
     """The cameras in float64 about their middle, and where that was: near the origin the world's place costs no digits."""
     exact = [one.to(torch.float64) for one in cameras]
     middle = torch.cat([one.centers for one in exact]).mean(dim=0) if exact else torch.zeros(3, dtype=torch.float64)
-    return [_moved(one, -middle) for one in exact], middle
-
-
-def _moved(cameras: Pinholes, shift: Float[Tensor, "3"]) -> Pinholes:
-    poses = torch.cat([cameras.rotations, (cameras.centers + shift)[:, :, None]], dim=2)
-    return dataclasses.replace(cameras, camera_to_world=poses)
+    return [one.moved(-middle) for one in exact], middle
 
 
 def even_angles(

@@ -78,6 +78,11 @@ class Pinholes:
             principal=self.principal.to(*args, **kwargs),
         )
 
+    def moved(self, shift: Float[Tensor, " 3"]) -> Pinholes:
+        """The same cameras ``shift`` (scene units) farther on."""
+        pose = torch.cat([self.rotations, (self.centers + shift)[:, :, None]], dim=2)
+        return dataclasses.replace(self, camera_to_world=pose)
+
     def pixel_centers(self) -> Float[Tensor, "h w 2"]:
         """(x, y) of every pixel centre."""
         like = {"device": self.focal.device, "dtype": self.focal.dtype}
