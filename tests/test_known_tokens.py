@@ -9,6 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
+from tiny_models import network_of
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -20,15 +21,6 @@ from fb_core.networks.ray_frames import RayFrames
 JOINT = DiTConfig(heads=2, head_dim=16, depth=3, in_channels=10, out_channels=4, text_width=0, ray_frames=True)
 APART = dataclasses.replace(JOINT, known_tokens="apart")
 VIEWS = 5
-
-
-def network_of(config: DiTConfig) -> DiT:
-    """A network in float64 whose every parameter matters."""
-    torch.manual_seed(1)
-    network = DiT(config).double().eval()
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    return network
 
 
 def drawn(*shape: int, seed: int = 0) -> Tensor:

@@ -6,6 +6,7 @@ import math
 import jaxtyping
 import pytest
 import torch
+from tiny_models import network_of
 
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.prepared import Prepared
@@ -13,15 +14,6 @@ from fb_core.networks.prepared import Prepared
 WITHOUT_TEXT = DiTConfig(heads=2, head_dim=8, depth=2, in_channels=10, out_channels=4, text_width=0)
 WITH_TEXT = dataclasses.replace(WITHOUT_TEXT, text_width=5)
 TIMES = [1.0, 2 / 3, 1 / 3]
-
-
-def network_of(config: DiTConfig) -> DiT:
-    """A network in float64 whose every parameter matters."""
-    torch.manual_seed(1)
-    network = DiT(config).double().eval()
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    return network
 
 
 def plain(network: DiT, state, conditioning, time: float, text=None) -> torch.Tensor:

@@ -10,25 +10,17 @@ import pytest
 import torch
 import torch.nn.functional as F
 from einops import rearrange
+from tiny_models import network_of
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import raymaps_of
 from fb_core.networks.blocks import Attention
-from fb_core.networks.dit import DiT, DiTConfig, TokenFacts
+from fb_core.networks.dit import DiTConfig, TokenFacts
 from fb_core.networks.ray_frames import RayFrames, frames_of_rays, transformed
 
 CONFIG = DiTConfig(heads=2, head_dim=16, depth=2, in_channels=10, out_channels=4, text_width=0, ray_frames=True, index="none")
 VIEWS, SIDE, SIZE = 4, 16, 32
-
-
-def network_of(config: DiTConfig) -> DiT:
-    """A network in float64 whose every parameter matters."""
-    torch.manual_seed(1)
-    network = DiT(config).double().eval()
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    return network
 
 
 def some_cameras(seed: int = 0) -> Pinholes:

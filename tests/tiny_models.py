@@ -31,3 +31,12 @@ def save_tiny_model(folder: Path, *, index: str = "flexible", seed: int = 0, ima
 def tiny_model(folder: Path, **options) -> Fillerbuster:
     """A loaded tiny random model."""
     return Fillerbuster.from_pretrained(save_tiny_model(folder / "model", **options))
+
+
+def network_of(config: DiTConfig) -> DiT:
+    """A transformer in float64 whose every parameter matters."""
+    torch.manual_seed(1)
+    network = DiT(config).double().eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return network
