@@ -16,6 +16,7 @@ from pathlib import Path
 
 from fb_core.files.faults import sentence_of
 from fb_core.interruption import ENDED_BY_USER, stop_on_signals
+from fb_core.training.distributed import left_at_once
 from method_configs.training_command import train_preset
 
 
@@ -51,4 +52,5 @@ def parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    main()
+    with left_at_once():
+        main()

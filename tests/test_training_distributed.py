@@ -126,3 +126,24 @@ def test_processes_that_share_a_pool_render_their_rooms_only_and_draw_what_one_d
 def test_nonsense_engines_are_refused(nonsense, shapes_unchecked):
     with pytest.raises(ValueError, match="training:"):
         EngineConfig(**nonsense)
+
+
+@pytest.mark.parametrize(
+    ("ending", "code", "said"),
+    [("pass", 0, ""), ("sys.exit(143)", 143, ""), ("sys.exit('Error: no data.')", 1, "Error: no data."), ("1 / 0", 1, "ZeroDivisionError")],
+)
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_process_of_a_group_ends_with_the_code_of_its_work(ending, code, said, size):
+    """Of several processes one ends without taking the interpreter apart (``atexit`` is not reached), one alone as always."""
+    program = f"""
+import atexit, sys
+from fb_core.training.distributed import left_at_once
+atexit.register(print, "taken apart")
+with left_at_once():
+    print("worked")
+    {ending}
+"""
+    environment = {**os.environ, "WORLD_SIZE": str(size), "PYTHONPATH": str(ROOT)}
+    child = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert child.returncode == code and said in child.stderr
+    assert child.stdout.split("\n")[:-1] == ["worked", "taken apart"][: 2 if size == 1 else 1]

@@ -16,7 +16,7 @@ from fb_core.flow import at_time, masked_loss, velocity
 from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAEConfig
 from fb_core.sampler import SamplingConfig
-from fb_core.training.distributed import Group, joined, whole
+from fb_core.training.distributed import Group, joined, left_at_once, whole
 from fb_core.training.dit_stage import DiTLossConfig
 from fb_core.training.loop import EngineConfig, LoopConfig, Run, Stage, row_generator
 from fb_core.training.recipe import Recipe
@@ -114,4 +114,5 @@ def _child(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    _child(Path(sys.argv[1]))
+    with left_at_once():
+        _child(Path(sys.argv[1]))
