@@ -27,6 +27,7 @@ FACTOR = 8
 STATE_CHANNELS = 2 * LATENT_CHANNELS
 CONDITIONING_CHANNELS = 2 * LATENT_CHANNELS + 2
 SEQUENCE_CHANNELS = STATE_CHANNELS + CONDITIONING_CHANNELS
+_VIEWS_AT_ONCE = 16  # so that memory does not grow with the number of views
 _ROUNDING = 1e-4  # of the mean of a mask over a latent's pixels
 
 
@@ -129,11 +130,19 @@ def encode_known(
     image_latents = encode_in_chunks(image_vae, told, views_at_once, generators)
     del told
     ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generators)
-    frames = None
-    if transformer is not None and transformer.ray_frames:
-        pairs = zip(raymaps01.split(views_at_once), rays_known.split(views_at_once), strict=True)
-        frames = torch.cat([frames_of_rays(2 * rays - 1, known, FACTOR * transformer.patch) for rays, known in pairs])
+    frames = frames_for(transformer, 2 * raymaps01 - 1, rays_known)
     return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known), frames)
+
+
+def frames_for(
+    transformer: DiTConfig | None, raymaps: Float[Tensor, "*b 6 hp wp"], rays_known: Float[Tensor, "*b 1 hp wp"]
+) -> Float[Tensor, "*b th tw 4 4"] | None:
+    """Frames of the known rays (in [-1, 1]) of every token of a ``transformer`` that attends in them; None for any other."""
+    if transformer is None or not transformer.ray_frames:
+        return None
+    parts = zip(raymaps.flatten(0, -4).split(_VIEWS_AT_ONCE), rays_known.flatten(0, -4).split(_VIEWS_AT_ONCE), strict=True)
+    frames = torch.cat([frames_of_rays(rays, known, FACTOR * transformer.patch) for rays, known in parts])
+    return frames.unflatten(0, raymaps.shape[:-3])
 
 
 def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: tuple[int, int]) -> Conditioning:

@@ -110,14 +110,14 @@ def run_completion(
     fitted = Views.cat([fitted_view(view, plan.size) for view in context])
     finished = [] if done is None else done.rounds
     anchors = None if done is None else _as_views(done[[i for i, origin in enumerate(done.origins) if origin.role == ANCHOR]])
+    ignored = config.strength == 1 and config.sampling(model.recommended_sampling).guess == "start"
     for planned in plan.rounds:
         if planned.number in finished:
             continue
         captured = fitted[list(plan.context_of(planned))]
         known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
-        ignored = config.strength == 1 and config.sampling(model.recommended_sampling).guess == "start"
-        guess = None if first_guess is None or ignored else first_guess(planned.cameras)
+        guess = None if ignored or first_guess is None else first_guess(planned.cameras)
         current = None if guess is None else Views.cat([*known, guess])
         images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
         origin = Origin(

@@ -44,7 +44,7 @@ ROOMS_TINY = Recipe(
     ),
     engine=EngineConfig(precision="auto", draw_ahead=True),  # on two cores data are waited for in 1 % of the time instead of 16 %
 )
-"""The small bundled model: rooms with cameras near the centre, 64x64, trained on a CPU in about four hours."""
+"""The small bundled model: rooms with cameras near the centre, 64x64, trained on one core in about nine hours."""
 
 ROOMS_ABLATION = dataclasses.replace(
     ROOMS_TINY,

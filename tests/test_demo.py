@@ -137,6 +137,16 @@ def test_only_an_earlier_demo_is_cleared_away(tmp_path, capsys):
     assert [path.name for path in (tmp_path / "new" / "demo").iterdir()] == [demo.MARKER]
 
 
+def test_a_demo_whose_training_failed_can_be_run_again(pretend_ns_train, tmp_path, monkeypatch):
+    for name, value in {"VIEWS": 4, "SIZE": 16, "HELD_OUT": 2}.items():
+        monkeypatch.setattr(demo, name, value)
+    pretend_ns_train("out of memory", code=3)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="ended with code 3: out of memory"):
+            demo.run_demo(tmp_path / "demo", iterations=10)
+        assert (tmp_path / "demo" / "runs" / "fillerbuster.log").read_text().strip() == "out of memory"
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"), [({"iterations": 0}, "at least 1, got 0"), ({"model": Path("nowhere")}, "no folder nowhere")]
 )

@@ -73,6 +73,17 @@ def test_the_frame_is_that_of_the_cameras_at_any_size_whatever_stands_in_unknown
     assert torch.allclose(frame_of(other, known).apply(other), frames[0].apply(raymaps), atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [*range(16, 36), 47, 48, 49, 63, 64, 65, 70])
+def test_the_frame_in_single_precision(size: int) -> None:
+    """In a world of another unit too."""
+    cameras, known = sized(size, 4, size, size + size % 5), masks(size, size + size % 5, size).float()
+    for there in (cameras, elsewhere(size, cameras)):
+        frame, expected = frame_of(raymaps_of(there.to(torch.float32)), known), CanonicalFrame.of(there[[0, 2, 3]])
+        assert torch.allclose(frame.rotation.double(), expected.rotation, atol=1e-4)
+        assert torch.allclose(frame.center.double(), expected.center, atol=1e-5)
+        assert frame.scale == pytest.approx(expected.scale, rel=1e-4)
+
+
 @pytest.mark.parametrize("size", [(16, 16), (17, 22), (22, 17), (33, 33), (70, 18)])
 def test_a_completion_is_the_same_to_the_bit_whatever_stands_in_unknown_rays(model, size) -> None:
     width, height = size

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fb_core.geometry.camera_paths import PATHS, Ellipse, path_cameras
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.carry_over import carried_over
 from fb_core.geometry.gravity import upright
 from fb_core.geometry.paths import (
     CaptureShape,
@@ -28,7 +29,7 @@ from fb_core.geometry.paths import (
 )
 from fb_core.geometry.pose_solver import recover_cameras
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
-from fb_core.geometry.shell import fit_shell, intersect
+from fb_core.geometry.shell import fit_shell, intersect, sphere
 from fb_core.geometry.similarity import Similarity
 from fb_core.geometry.triangulation import Features, triangulate
 from fb_nerfstudio.completed_views import DENSIFY, CompletedViews, Origin
@@ -41,6 +42,7 @@ from fb_nerfstudio.unseen import find_unseen, seen_by_nobody_else
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 FAR = (3e3, 1e5, 1e6)
 WORLDS = [(dtype, far) for dtype in (torch.float64, torch.float32) for far in FAR]
+NEAR = torch.tensor([4000.0, -3000.0, 500.0])  # float32 still tells a millimetre of a capture in metres there
 LATTICE = 8  # places are whole eighths: float32 holds them exactly as far as two million units off, so that a moved world is the same world
 
 
@@ -50,6 +52,10 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 def away(far: float) -> Tensor:
     return torch.tensor([far, -0.5 * far, 0.25 * far], dtype=torch.float64).round()
+
+
+def drawn(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
 def on_lattice(places: Tensor) -> Tensor:
@@ -113,6 +119,28 @@ def test_cameras_are_kept_clear_of_the_same_walls(far, dtype) -> None:
     assert torch.allclose(kept + shift, moved.double(), atol=4 * torch.finfo(dtype).eps * far + 1e-9)
     assert float(distances(moved, points).min(dim=1).values.min()) >= 0.5
     assert bool((distances(moved, points).min(dim=1).values >= 2.0 - 1e-6).any())
+
+
+@pytest.mark.parametrize("shift, tolerance", [(away(1e6), 1e-6), (NEAR, 2e-3)])
+def test_cameras_are_kept_clear_in_single_precision_too(shift, tolerance):
+    """With many points, for which torch.cdist multiplies matrices, and in single precision 5000 units off too."""
+    centers, points, refuges = drawn(40, 3, seed=3), 1.2 * drawn(300, 3, seed=4), 0.2 * drawn(30, 3, seed=5)
+    here = kept_clear(centers, shell=sphere(torch.zeros(3, dtype=torch.float64), 2.0), points=points, clearance=0.4, refuges=refuges)
+    moved = [(values + shift.double()).to(shift.dtype) for values in (centers, points, refuges)]
+    there = kept_clear(moved[0], shell=sphere(shift, 2.0), points=moved[1], clearance=0.4, refuges=moved[2])
+    same = ((there.double() - shift.double() - here).norm(dim=1) < tolerance).float().mean()
+    assert float(same) >= (1.0 if shift.dtype == torch.float64 else 0.9)  # single precision may move a place across the clearance
+    apart = (there.double()[:, None] - moved[1].double()).norm(dim=-1).min(dim=1).values
+    at_home = (there.double()[:, None] - moved[2].double()).norm(dim=-1).min(dim=1).values < tolerance
+    assert bool(((apart > 0.4 - tolerance) | at_home).all())
+
+
+def test_distances_far_from_the_origin_in_single_precision():
+    a, b = drawn(60, 3, seed=6), drawn(70, 3, seed=7)
+    exact = (a[:, None] - b).norm(dim=-1)
+    moved = [(values + NEAR.double()).float() for values in (a, b)]
+    assert float((distances(*moved).double() - exact).abs().max()) < 2e-3
+    assert distances(a, b[:0]).shape == (60, 0)
 
 
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
@@ -259,3 +287,18 @@ def test_recovered_cameras_their_world_and_the_canonical_frame(dtype, far) -> No
     assert torch.allclose(worlds_of[0].points(here.centers), worlds_of[1].points(there.centers), atol=1e-6)
     between = Similarity.between((there.rotations, there.centers), (here.rotations, here.centers))
     assert between.scale == pytest.approx(1.0, abs=1e-6) and torch.allclose(between.points(there.centers), here.centers.double(), atol=1e-5)
+
+
+def test_frames_and_what_is_carried_over() -> None:
+    guesses, frames = [], []
+    images = torch.rand(5, 3, 24, 32, generator=seeded(), dtype=torch.float64)
+    cameras = room(10, inward=True)
+    cameras = dataclasses.replace(cameras, height=24, principal=cameras.principal.new_tensor([16.0, 12.0]).expand(10, 2))
+    for moved in (cameras, cameras.moved(away(1e6))):
+        rays = raymaps_of(moved)
+        guesses.append(carried_over(images, torch.ones_like(rays[:5, :1]), rays[:5], rays[5:], distance=torch.full_like(rays[5:, :1], 2.0)))
+        frames.append(CanonicalFrame.of_raymaps(rays).apply(rays))
+    torch.testing.assert_close(frames[1], frames[0], atol=1e-5, rtol=0)
+    assert float((guesses[1].there == guesses[0].there).double().mean()) > 0.999
+    both = guesses[0].there * guesses[1].there
+    assert float(both.mean()) > 0.2 and float(((guesses[1].images - guesses[0].images).abs() * both).mean()) < 1e-5

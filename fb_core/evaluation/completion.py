@@ -24,6 +24,8 @@ from fb_core.views import Views
 
 METHODS = ("model", "nearest", "mean", "reprojected", "reprojected by true depth")
 """What is always compared; beside these the model may start from re-projections (`started_at`)."""
+TOLD = "model told what is carried over"
+"""The model that is told the pixels carried over by direction, as a guess with a mask between 0 and 1."""
 _FAR = 1e4  # metres; so far away that only the camera's rotation counts
 _FIRST_UNSEEN_ROOM = 10**12  # seeds that no training reaches
 _OTHER_SAMPLE = 10**6  # between the seeds of one room's samples
@@ -139,10 +141,6 @@ def _told_guess(given: RoomViews, hidden: Pinholes) -> Carried:
 def started_at(strength: float) -> str:
     """The name of the model that starts from what is reprojected, noised to that time."""
     return f"model from reprojected, strength {strength:g}"
-
-
-TOLD = "model told what is carried over"
-"""The name of the model that is told the pixels carried over by direction, as a guess with a mask between 0 and 1."""
 
 
 def edge_energy(generated: Float[Tensor, "m 3 h w"], truth: Float[Tensor, "m 3 h w"]) -> float:

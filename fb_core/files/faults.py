@@ -50,6 +50,17 @@ def telling(target: Path, unfinished: Path) -> Iterator[None]:
         raise CannotWrite(_named(cause, target, unfinished), cause) from error
 
 
+@contextmanager
+def all_told(path: Path) -> Iterator[None]:
+    """Every error of the system, which must come from writing ``path``, becomes :class:`CannotWrite`."""
+    try:
+        yield
+    except CannotWrite:
+        raise
+    except OSError as error:
+        raise CannotWrite(path, error) from error
+
+
 def is_of_the_disk(error: BaseException) -> bool:
     """Whether an error says that a disk is full or cannot be written, whatever file it names."""
     return isinstance(error, OSError) and error.errno in _OF_THE_DISK

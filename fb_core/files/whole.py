@@ -29,7 +29,7 @@ try:
 except ImportError:  # no system with such locks; what killed processes leave then stays
     fcntl = None
 
-from fb_core.files.faults import CannotWrite, telling
+from fb_core.files.faults import CannotWrite, all_told, telling
 from fb_core.files.ownership import Target, foreign_files, write_mark
 
 _OWNER, _NEW, _OLD, _GONE = "owner", "new", "old", "gone"
@@ -55,13 +55,13 @@ def whole_folder(target: Target) -> Iterator[Path]:
     target.check()
     with unfinished_beside(folder) as work:
         new = work / _NEW
-        with _told(folder):
+        with all_told(folder):
             new.mkdir()
         with telling(folder, new):
             yield new
             write_mark(new, target.kind)
         target.check()
-        with _told(folder):
+        with all_told(folder):
             _put_in_place(work, folder)
 
 
@@ -84,7 +84,7 @@ def whole_file(path: str | os.PathLike[str], *, durable: bool = False) -> Iterat
             if durable:
                 with new.open("rb") as file:
                     os.fsync(file.fileno())
-        with _told(path):
+        with all_told(path):
             os.replace(new, path)
 
 
@@ -116,7 +116,7 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
     What killed processes have left of theirs for the same place is cleaned up first.
     """
     with ExitStack() as stack:
-        with _told(path):
+        with all_told(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             for work in _unfinished(path):
                 _clean_up(work, path)
@@ -137,7 +137,7 @@ def remove_folder(target: Target) -> None:
 
 def discard(folder: Path, *, foreign: list[str]) -> None:
     """Take away a folder in one step; if it holds files of somebody else, it stays beside its place with a warning."""
-    with unfinished_beside(folder) as work, _told(folder):
+    with unfinished_beside(folder) as work, all_told(folder):
         if foreign:
             _keep(folder, folder, f"held files that are not ours, such as {foreign[0]}")
         else:
@@ -299,14 +299,3 @@ def _mend(work: Path, path: Path) -> None:
 def _real(folder: Path) -> Path:
     """The folder with the links of all folders above it followed; its own name stays, link or not."""
     return Path(os.path.realpath(folder)) if folder.name in ("", "..") else Path(os.path.realpath(folder.parent)) / folder.name
-
-
-@contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Every error of the system becomes one sentence."""
-    try:
-        yield
-    except CannotWrite:
-        raise
-    except OSError as error:
-        raise CannotWrite(path, error) from error

@@ -20,6 +20,8 @@ BELIEF_BY_DIRECTION = 0.35
 """How far to believe pixels that are carried over by direction alone, which are off where surfaces are near (what models learn)."""
 BELIEF_OF_RENDERS = 0.7
 """How far to believe pixels whose geometry is known but for the errors of splats (what models learn)."""
+SAME_SURFACE = 0.06
+"""Share of the distance by which two distances may differ and still be those of one surface."""
 _LEAST_COSINE = 0.05
 """Rays that leave a known view's axis by more than 87 degrees are not looked up in it."""
 _WHOLE = 0.99
@@ -53,7 +55,7 @@ def carried_over(
     *,
     distance: Float[Tensor, "m 1 h w"] | None = None,
     known_distance: Float[Tensor, "k 1 h w"] | None = None,
-    same_surface: float = 0.06,
+    same_surface: float = SAME_SURFACE,
 ) -> Carried:
     """The guess of m views from k known ones, all with known rays of pinhole cameras (any crop; no lens distortion).
 

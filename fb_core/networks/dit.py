@@ -5,7 +5,7 @@ that whatever is constant during sampling can be computed once. Parameter names 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, cast, get_args
 
@@ -170,27 +170,23 @@ class DiT(nn.Module):
         straight to what is known. Raises ValueError for no views, for a size that the patch does not divide, for another channel
         count, and for a text that is missing or too much.
         """
-        _, views, channels, height, width = sequence.shape
-        if channels != self.config.in_channels:
-            raise ValueError(f"sequence: expected {self.config.in_channels} channels, got {channels}.")
+        _, views, count, height, width = sequence.shape
+        if count != self.config.in_channels:
+            raise ValueError(f"sequence: expected {self.config.in_channels} channels, got {count}.")
         known, noisy = self.known_of(facts), self.config.out_channels
-        given = sequence
+        modulation, texts, frames = self.modulate(time), self.text_context(text), self.frames_of(facts)
+        state, told, channels = sequence[:, :, :noisy], sequence[:, :, noisy : 2 * noisy], sequence
         if known is not None:
-            told = sequence[:, :, noisy : 2 * noisy]
-            sequence = torch.cat([self.where_known(known, told, sequence[:, :, :noisy]), sequence[:, :, noisy:]], dim=2)
-        tokens = self.embed_patches(sequence) + self.positions(views, height, width, index, device=sequence.device)
-        modulation, frames = self.modulate(time), self.frames_of(facts)
+            channels = torch.cat([self.where_known(known, told, state), sequence[:, :, noisy:]], dim=2)
+        tokens = self.embed_patches(channels) + self.positions(views, height, width, index, device=sequence.device)
         if known is None:
-            velocity = self.run_blocks(tokens, modulation, self.text_context(text), frames)
-        else:
-            apart, others = streams(rearrange(known, "b n h w -> b (n h w)"), facts.sequences_per_scene)
-            texts = self.text_context(text)
-            looked_up = self.run_known(tokens, apart, texts, frames)
-            velocity = self.run_unknown(tokens, others, looked_up, modulation, texts, frames)
+            velocity = self.run_blocks(tokens, modulation, texts, frames)
+            return self.unpatchify(velocity, views, height, width).to(sequence.dtype)
+        apart, others = streams(rearrange(known, "b n h w -> b (n h w)"), facts.sequences_per_scene)
+        looked_up = self.run_known(tokens, apart, texts, frames)
+        velocity = self.run_unknown(tokens, others, looked_up, modulation, texts, frames)
         velocity = self.unpatchify(velocity, views, height, width).to(sequence.dtype)
-        if known is None:
-            return velocity
-        return self.where_known(known, self.leading_to(told, given[:, :, :noisy], time), velocity)
+        return self.where_known(known, self.leading_to(told, state, time), velocity)
 
     def known_of(self, facts: TokenFacts) -> Bool[Tensor, "b n h w"] | None:
         """Which tokens stand apart; None where none does."""
@@ -285,9 +281,19 @@ class DiT(nn.Module):
         frames: RayFrames | None = None,
     ) -> Float[Tensor, "b tokens out"]:
         """Patches of velocity of tokens that carry their positions."""
-        for block, block_modulation, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
-            tokens = block(tokens, block_modulation, context, frames)
-        return self._patches(tokens, modulation.final)
+        return self._patches(self._through_blocks(tokens, modulation.blocks, contexts, frames), modulation.final)
+
+    def _through_blocks(
+        self,
+        tokens: Float[Tensor, "b tokens d"],
+        modulations: Iterable[Tensor],
+        contexts: Sequence[KeysValues | None],
+        frames: RayFrames | None = None,
+        relation: Relation | None = None,
+    ) -> Float[Tensor, "b tokens d"]:
+        for block, modulation, context in zip(self.blocks, modulations, contexts, strict=True):
+            tokens = block(tokens, modulation, context, frames, relation)
+        return tokens
 
     def run_known(
         self, tokens: Float[Tensor, "b tokens d"], stream: Stream, contexts: Sequence[KeysValues | None], frames: RayFrames | None
@@ -295,10 +301,7 @@ class DiT(nn.Module):
         """Keys and values of known tokens in every block, scene by scene: all that other tokens see of them."""
         frames = None if frames is None else frames.chosen(stream.places)
         relation = Relation(stream=stream, frames=frames, last=self.blocks[-1].attn1)
-        modulation = self.modulate(tokens.new_zeros(1))
-        row = stream.taken(tokens)
-        for block, scale_shifts, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
-            row = block(row, scale_shifts, context, None, relation)
+        self._through_blocks(stream.taken(tokens), self.modulate(tokens.new_zeros(1)).blocks, contexts, relation=relation)
         return relation.kept
 
     def run_unknown(
@@ -313,9 +316,8 @@ class DiT(nn.Module):
         """Patches of velocity of the tokens that are not known, which see the known ones too; zeros at known tokens."""
         frames = None if frames is None else frames.chosen(stream.places)
         relation = Relation(stream=stream, frames=frames, known=known)
-        row = stream.taken(tokens)
-        for block, scale_shifts, context in zip(self.blocks, modulation.blocks, contexts, strict=True):
-            row = block(row, stream.modulation(scale_shifts), context, None, relation)
+        modulations = map(stream.modulation, modulation.blocks)
+        row = self._through_blocks(stream.taken(tokens), modulations, contexts, relation=relation)
         patches = self._patches(row, stream.modulation(modulation.final))
         return stream.put_into(patches.new_zeros(*tokens.shape[:2], patches.shape[-1]), patches)
 

@@ -6,17 +6,49 @@ block, all that other tokens see of known ones that stand apart, the position em
 share, the noisy latents' tokens and the modulations, is computed once for all of them.
 """
 
+from __future__ import annotations
+
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from einops import rearrange
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fb_core.networks.blocks import Attention, KeysValues, Modulation
 from fb_core.networks.dit import NO_FACTS, DiT, TokenFacts
-from fb_core.networks.known_tokens import streams
+from fb_core.networks.known_tokens import Stream, streams
+from fb_core.networks.ray_frames import RayFrames
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Apart:
+    """Known tokens that stand apart, in some branches."""
+
+    known: Bool[Tensor, "b n h w"]
+    """Which tokens they are."""
+    told: Float[Tensor, "b n z lh lw"]
+    """Their latents."""
+    others: Stream
+    """The tokens that are not known."""
+    looked_up: dict[Attention, list[KeysValues]]
+    """All that the others see of the known ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bound:
+    """What is the same at every step, for some branches of some views."""
+
+    tokens: Float[Tensor, "b tokens d"]
+    """The projected conditioning."""
+    contexts: list[KeysValues | None]
+    """Keys and values of the text in every block."""
+    frames: RayFrames | None
+    """What attention is told in."""
+    apart: _Apart | None
+    """None where no known token stands apart."""
 
 
 class Prepared:
@@ -62,7 +94,7 @@ class Prepared:
         self._size = height, width
         self._facts = facts
         self._told = conditioning[:, :, :noisy] if dit.known_of(facts) is not None else None
-        self._apart: dict[tuple[int, int], dict[Attention, list[KeysValues]]] = {}
+        self._bound: dict[tuple[int, int], _Bound] = {}
         self._tokens = rearrange(dit.embed_patches(conditioning, first_channel=noisy), "b (n places) d -> b n places d", n=views)
         self._contexts = dit.text_context(text)
         self._times = {time: step for step, time in enumerate(times)}
@@ -86,7 +118,7 @@ class Prepared:
         velocities = []
         for first in range(0, self.branches, self.branches_at_once):
             part = slice(first, min(first + self.branches_at_once, self.branches))
-            velocities.append(self._velocity(state, shared, modulation, time, part, views))
+            velocities.append(self._velocity(state, shared, modulation, time, self._bound_to(part, views)))
         return torch.cat(velocities).to(state.dtype)
 
     def _velocity(
@@ -95,43 +127,52 @@ class Prepared:
         shared: Float[Tensor, "1 tokens d"],
         modulation: Modulation,
         time: float,
-        part: slice,
-        views: Int[Tensor, "m"] | None,
+        bound: _Bound,
     ) -> Float[Tensor, "b n z h w"]:
         """The velocity of some branches, given what their tokens share."""
-        told_tokens = rearrange(self._tokens[part] if views is None else self._tokens[part][:, views], "b n places d -> b (n places) d")
-        contexts = [self._context(context, part) for context in self._contexts]
-        facts = self._facts_of(part, views)
-        known, frames = self.dit.known_of(facts), self.dit.frames_of(facts)
-        if known is None or self._told is None:
-            return self.dit.unpatchify(self.dit.run_blocks(shared + told_tokens, modulation, contexts, frames), len(state), *self._size)
-        told = self._told[part] if views is None else self._told[part][:, views]
-        apart, others = streams(rearrange(known, "b n h w -> b (n h w)"))
-        looked_up = self._apart.get((part.start, part.stop)) if views is None else None
-        if looked_up is None:
-            clean = self.dit.embed_patches(told, bias=False) + self._positions[len(state)] + told_tokens
-            looked_up = self.dit.run_known(clean, apart, contexts, frames)
-            if views is None:
-                self._apart[part.start, part.stop] = looked_up
-        patches = self.dit.run_unknown(shared + told_tokens, others, looked_up, modulation, contexts, frames)
+        tokens, apart = shared + bound.tokens, bound.apart
+        if apart is None:
+            patches = self.dit.run_blocks(tokens, modulation, bound.contexts, bound.frames)
+            return self.dit.unpatchify(patches, len(state), *self._size)
+        patches = self.dit.run_unknown(tokens, apart.others, apart.looked_up, modulation, bound.contexts, bound.frames)
         velocity = self.dit.unpatchify(patches, len(state), *self._size)
-        leading = self.dit.leading_to(told, state[None], torch.full((1,), time, device=state.device))
-        return self.dit.where_known(known, leading.expand_as(velocity), velocity)
+        leading = self.dit.leading_to(apart.told, state[None], torch.full((1,), time, device=state.device))
+        return self.dit.where_known(apart.known, leading.expand_as(velocity), velocity)
 
-    def _facts_of(self, part: slice, views: Tensor | None) -> TokenFacts:
-        frames, known = (
-            None if values is None else values[part] if views is None else values[part][:, views] for values in self._facts[:2]
-        )
-        return TokenFacts(frames=frames, known=known)
+    def _bound_to(self, part: slice, views: Int[Tensor, "m"] | None) -> _Bound:
+        """What is the same at every step, remembered for whole sets of views."""
+        remembered = self._bound.get((part.start, part.stop)) if views is None else None
+        if remembered is not None:
+            return remembered
 
-    def only(self, branches: slice) -> "Prepared":
+        def chosen(values: Tensor) -> Tensor:
+            return values[part] if views is None else values[part][:, views]
+
+        frames, known = (None if values is None else chosen(values) for values in self._facts[:2])
+        facts = TokenFacts(frames=frames, known=known)
+        frames, known = self.dit.frames_of(facts), self.dit.known_of(facts)
+        told_tokens = chosen(self._tokens)
+        count, tokens = told_tokens.shape[1], rearrange(told_tokens, "b n places d -> b (n places) d")
+        contexts = [self._context(context, part) for context in self._contexts]
+        apart = None
+        if known is not None and self._told is not None:
+            told = chosen(self._told)
+            stream, others = streams(rearrange(known, "b n h w -> b (n h w)"))
+            clean = self.dit.embed_patches(told, bias=False) + self._positions[count] + tokens
+            apart = _Apart(known=known, told=told, others=others, looked_up=self.dit.run_known(clean, stream, contexts, frames))
+        bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart)
+        if views is None:
+            self._bound[part.start, part.stop] = bound
+        return bound
+
+    def only(self, branches: slice) -> Prepared:
         """The same with some of its branches; shares all constants, so it costs nothing."""
         chosen = copy.copy(self)
         chosen._tokens = self._tokens[branches]
         frames, known = (None if values is None else values[branches] for values in self._facts[:2])
         chosen._facts = TokenFacts(frames=frames, known=known)
         chosen._told = None if self._told is None else self._told[branches]
-        chosen._apart = {}
+        chosen._bound = {}
         chosen.branches = len(chosen._tokens)
         chosen.branches_at_once = min(self.branches_at_once, chosen.branches)
         chosen._contexts = [

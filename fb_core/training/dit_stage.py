@@ -13,14 +13,13 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import FACTOR, Conditioning, assemble, encode_in_chunks, join, only_known, split, unsplit, with_guess
+from fb_core.conditioning import Conditioning, assemble, encode_in_chunks, frames_for, join, only_known, split, unsplit, with_guess
 from fb_core.data.training_task import Sequences, Source, TaskConfig
 from fb_core.flow import at_time, logit_normal_times, masked_loss, velocity
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.masks import to_latent_grid
 from fb_core.networks.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.embeddings import index_positions
-from fb_core.networks.ray_frames import frames_of_rays
 from fb_core.networks.vae import VAE
 from fb_core.training.guesses import Guess, guesses_of
 from fb_core.training.loop import Stage, row_generator
@@ -44,7 +43,6 @@ class DiTLossConfig:
     """Captioned single pictures that stand for one sequence."""
     draws: int = 1
     """Draws of (time, noise) for every sequence, which is encoded once, and whose known tokens are computed once where they are apart."""
-
     pure_noise: float = 0.0
     """Share of the draws at time 1 exactly, where the answer is the mean of all that may be there; one step from noise needs it."""
 
@@ -154,13 +152,12 @@ class DiTStage(Stage):
         noises, positions = ([row_generator(self.seed, step, row, stream) for row in rows] for stream in (1, 2))
         mode, (count, views, *latent), draws = self.network.config.index, data.shape, self.config.draws
         each = count // len(rows) * draws
-        facts = conditioning.facts(self.network.config)
         if draws > 1:
             data = data.repeat_interleave(draws, dim=0)
             conditioning = conditioning.repeated(draws)
             image_weight, rays_weight = (w if w is None else w.repeat_interleave(draws, dim=0) for w in (image_weight, rays_weight))
-            facts = conditioning.facts(self.network.config)._replace(sequences_per_scene=draws)
             captions = captions if captions is None else tuple(caption for caption in captions for _ in range(draws))
+        facts = conditioning.facts(self.network.config)._replace(sequences_per_scene=draws)
         times = torch.cat([self._times(each, generator) for generator in noises]).to(data.device)
         noise = torch.cat([torch.randn(each, views, *latent, generator=generator) for generator in noises]).to(data)
         index = torch.cat([index_positions(mode, each // draws, views, generator=generator) for generator in positions]).to(data.device)
@@ -253,7 +250,5 @@ def encode_sequences(
             masked[partial] = encode_in_chunks(vae, told[partial], 256)
         parts.append([rearrange(x, "(b n) c h w -> b n c h w", b=batch) for x in (clean, masked, to_latent_grid(known))])
     (image, image_masked, image_known), (rays, rays_masked, rays_known) = parts
-    frames = None
-    if transformer is not None and transformer.ray_frames:
-        frames = frames_of_rays(sequences.raymaps, sequences.rays_known, FACTOR * transformer.patch)
+    frames = frames_for(transformer, sequences.raymaps, sequences.rays_known)
     return unsplit(image, rays), assemble(image_masked, rays_masked, image_known, rays_known, frames)

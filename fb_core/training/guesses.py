@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.data.training_task import Draw, Sequences, TaskConfig
-from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, BELIEF_OF_RENDERS, Carried, carried_over
+from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, BELIEF_OF_RENDERS, SAME_SURFACE, Carried, carried_over
 
 _JITTER = 0.1
 _WORST_DEPTH = 0.12  # relative, of the waves by which surfaces lie wrong
@@ -83,7 +83,7 @@ def _drawn(
         wrong = wrong * (1 + worse * _WORST_SCALE * (2 * float(torch.rand((), generator=generator)) - 1))
         guess = carried_over(
             images, known, *raymaps, distance=distance * wrong, known_distance=sequences.distance[number, given],
-            same_surface=0.06 + 2 * worse * _WORST_DEPTH,
+            same_surface=SAME_SURFACE + 2 * worse * _WORST_DEPTH,
         )  # fmt: skip
         guess = _as_splats_err(guess, worse, generator)
     return guess.images, belief * guess.there

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from fb_core.files.faults import CannotWrite
+from fb_core.files.faults import all_told
 from fb_core.files.whole import whole_file
 
 _logger = logging.getLogger(__name__)
@@ -43,13 +41,13 @@ class ProgressLog:
     def _show(self, group: str, values: dict[str, float], step: int) -> None:
         if self._board is not None:
             for name, value in values.items():
-                with _told(self.folder / "tensorboard"):
+                with all_told(self.folder / "tensorboard"):
                     self._board.add_scalar(f"{group}/{name}", value, step)
 
     def close(self) -> None:
         """Draw the curves of all losses and of what unseen data say."""
         if self._board is not None:
-            with _told(self.folder / "tensorboard"):
+            with all_told(self.folder / "tensorboard"):
                 self._board.flush()
         for path, name in ((self._path, "loss.png"), (self._validation, "validation.png")):
             if path.exists():
@@ -85,7 +83,7 @@ class ProgressLog:
 def _append(path: Path, step: int, values: dict[str, float]) -> None:
     """A further line, whole or not at all."""
     line = json.dumps({"step": step, **{name: round(value, 6) for name, value in values.items()}}) + "\n"
-    with _told(path), path.open("ab") as log:
+    with all_told(path), path.open("ab") as log:
         end = log.tell()
         try:
             log.write(line.encode())
@@ -93,14 +91,6 @@ def _append(path: Path, step: int, values: dict[str, float]) -> None:
         except OSError:
             os.truncate(path, end)
             raise
-
-
-@contextmanager
-def _told(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise CannotWrite(path, error) from error
 
 
 def _board(folder: Path, from_step: int):

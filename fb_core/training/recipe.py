@@ -253,8 +253,7 @@ def adopt_autoencoders(recipe: Recipe, folder: Path) -> None:
         state |= {"seconds": record.get("seconds", 0), "smoothed": record.get("losses", {})}
         target.mkdir(parents=True, exist_ok=True)
         Checkpoints(target, keep=1).write(state)
-        spread = {"scaling": theirs.scaling} | record.get("reconstruction", {}) | {"scaling": theirs.scaling}
-        (target / "spread.json").write_text(json.dumps(spread, indent=1) + "\n")
+        _finish_vae(target, record.get("reconstruction", {}) | {"scaling": theirs.scaling})
 
 
 def trained_vae(recipe: Recipe, kind: str, folder: Path, device: torch.device | str = "cpu") -> VAE:
@@ -280,8 +279,13 @@ def _record_spread(task: VAEStage, averaged: dict, folder: Path) -> None:
     values = torch.cat([task.values(-1 - k, range(task.batch)) for k in range(16)])
     mean, _ = task.network.posterior(values)
     rows = {"scaling": 1.0 / float(mean.std()), "views": len(values), **reconstruction_error(task.network, values)}
+    _finish_vae(folder, rows)
+
+
+def _finish_vae(folder: Path, spread: dict[str, float]) -> None:
+    """The file of scaling and reconstruction, whose being there says that an autoencoder's stage is finished."""
     with whole_file(folder / "spread.json") as unfinished:
-        unfinished.write_text(json.dumps(rows, indent=1) + "\n")
+        unfinished.write_text(json.dumps(spread, indent=1) + "\n")
 
 
 def export(recipe: Recipe, folder: Path, output: Path, *, dtype: torch.dtype = torch.float32) -> None:
