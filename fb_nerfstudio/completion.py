@@ -203,7 +203,9 @@ def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, 
 
 
 def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None) -> str:
-    """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left."""
+    """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left; two where the capture decides."""
+    if plan.covered is not None and not plan.rounds:
+        return f"The capture shows {plan.covered[0]:.0%} of what surrounds it, so no view is generated."
     context = max(len(plan.context_of(one)) for one in plan.rounds)
     asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
     left = [one for one in plan.rounds if done is None or one.number not in done.rounds]
@@ -212,7 +214,10 @@ def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainte
     along = "" if config.camera_path is None else f" along {config.camera_path.name}"
     sequence = context + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
     passes = f"{len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to {sequence} views"
-    return (
+    decided = ""
+    if plan.covered is not None:
+        decided = f"The capture shows {plan.covered[0]:.0%} of what surrounds it, with the new views {plan.covered[1]:.0%}. "
+    return decided + (
         f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
         f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {passes}, "
         f"conditioned on {context} of {plan.captured} captured views{asked}{there}{expectation(sequences, plan.size, config, model)}."

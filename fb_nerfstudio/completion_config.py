@@ -11,6 +11,8 @@ from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_STEPS, 
 from fb_core.networks.precision import Precision
 from fb_core.sampling.options import Guess, SamplingConfig
 
+_MOST_ANCHORS = 24  # where the capture decides
+
 
 @dataclass
 class PlacementConfig:
@@ -73,12 +75,15 @@ class CompletionConfig:
     context_choice: Literal["spread", "stride", "overlap"] = "spread"
     """Context views that differ most in place and direction, or every so many (the paper's choice); overlap: those for the anchors, and
     for each later round the views that show most of what its cameras will show."""
-    anchor_views: int = 24
-    """Views generated together in the first round."""
+    anchor_views: int | None = None
+    """Views generated together in the first round. None: the capture decides how many views it needs and where, in all rounds; at most
+    24 in the first one."""
     densify_rounds: int = 3
     """Rounds after the anchors, each conditioned on the context and the anchors."""
     densify_views: int = 24
     """Views generated together in each of these rounds."""
+    least_gain: float = 0.02
+    """Where the capture decides (`anchor_views` None): share of what it has not seen that a further view must show, from 0 to 1."""
     camera_path: Path | None = None
     """Camera path saved in nerfstudio's viewer (Render tab): generate these views, where they are, instead of placing cameras."""
     masked: MaskedConfig = field(default_factory=MaskedConfig)
@@ -138,7 +143,7 @@ class CompletionConfig:
             if value is not None and value < least:
                 raise ValueError(f"completion.{name}: expected at least {least}, got {value}")
             require_between(f"completion.{name}", least if value is None else value, least, most)
-        new = self.anchor_views + self.densify_rounds * self.densify_views
+        new = self.most_anchors + self.densify_rounds * self.densify_views
         require_between("completion: anchor_views and densify_rounds times densify_views together", new, 0, MOST_VIEWS)
         if self.inpainter == "diffusion" and self.inpainter_weights is not None:
             raise ValueError(
@@ -153,6 +158,8 @@ class CompletionConfig:
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         require_between("completion.image_size", self.image_size or 16, 16, MOST_SIDE)
+        if not 0.0 <= self.least_gain <= 1.0:
+            raise ValueError(f"completion.least_gain: expected a share from 0 to 1, got {self.least_gain}")
         if not 0.0 <= self.generated_share <= 1.0:
             raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
         if not 0.0 < self.strength <= 1.0:
@@ -161,6 +168,11 @@ class CompletionConfig:
             raise ValueError(f"completion.memory_budget: expected a positive number of GiB, got {self.memory_budget}")
         if self.view_weight < 0:
             raise ValueError(f"completion.view_weight: expected 0 or more, got {self.view_weight}")
+
+    @property
+    def most_anchors(self) -> int:
+        """Views that the first round has at most."""
+        return _MOST_ANCHORS if self.anchor_views is None else self.anchor_views
 
     def sampling(self, recommended: SamplingConfig = SamplingConfig()) -> SamplingConfig:
         """How to sample: these options where they are given, the model's recommendation elsewhere."""

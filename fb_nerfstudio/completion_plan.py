@@ -18,6 +18,7 @@ from torch import Tensor
 
 from fb_core.data.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.coverage import Coverage, choose_views
 from fb_core.geometry.paths import (
     CaptureShape,
     cylinder_centers,
@@ -29,7 +30,8 @@ from fb_core.geometry.paths import (
     spread_subset,
     strided_subset,
 )
-from fb_core.geometry.shell import Shell, fit_shell
+from fb_core.geometry.shell import Shell, fit_shell, sphere
+from fb_nerfstudio.candidate_views import Candidates, looking_in, looking_out
 from fb_nerfstudio.completed_views import ANCHOR, DENSIFY
 from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
 from fb_nerfstudio.context_views import nearest_context
@@ -37,6 +39,8 @@ from fb_nerfstudio.context_views import nearest_context
 _ANCHOR_LEVELS, _DENSIFY_LEVELS = 2, 3
 _SEEN_NEED = 0.2  # looking at what the capture has seen is worth this much of looking at what it has not
 _PLANNING_POINTS = 4000
+_BEYOND = 1.25  # how far off an object new cameras may stand, in the distance of the farthest captured one
+_PLACES, _CAPTURED_PLACES = 24, 16  # where candidates stand: new places for each role, and captured ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +79,8 @@ class CompletionPlan:
     """Anchors first."""
     size: int
     """Side of all views in pixels while they are generated."""
+    covered: tuple[float, float] | None = None
+    """Share of what surrounds the capture that its pictures show, and that they and the new views show; None where nobody asked."""
 
     @property
     def new_views(self) -> int:
@@ -114,11 +120,25 @@ def plan_completion(
     site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, known=known, placement=config.placement)
     count = config.context_views
     context = strided_subset(len(cameras), count) if config.context_choice == "stride" else spread_subset(cameras, count)
-    rounds = _placed_rounds(site, context, config, size) if config.camera_path is None else _path_rounds(config, size)
+    covered = None
+    if config.camera_path is not None:
+        rounds = _path_rounds(config, size)
+    elif config.anchor_views is None:
+        rounds, covered = _needed_rounds(site, context, config, size)
+    else:
+        rounds = _placed_rounds(site, context, config, size)
     if config.context_choice == "overlap":
         rounds = [_with_own_context(one, context, site, count) for one in rounds]
     used = dict.fromkeys([*context, *(index for one in rounds for index in one.context or ())])
-    return CompletionPlan(shape=shape, shell=site.shell, captured=len(cameras), context=tuple(used), rounds=tuple(rounds), size=size)
+    return CompletionPlan(
+        shape=shape,
+        shell=site.shell,
+        captured=len(cameras),
+        context=tuple(used),
+        rounds=tuple(rounds),
+        size=size,
+        covered=covered,
+    )
 
 
 def _with_own_context(planned: PlannedRound, context: Sequence[int], site: _Site, count: int) -> PlannedRound:
@@ -133,7 +153,7 @@ def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig
     need = site.need()
     generator = torch.Generator().manual_seed(round_seed(config.seed, -1))
     rounds = []
-    for number, views in enumerate([config.anchor_views] + [config.densify_views] * config.densify_rounds):
+    for number, views in enumerate([config.most_anchors] + [config.densify_views] * config.densify_rounds):
         if views == 0:
             continue
         role = ANCHOR if number == 0 else DENSIFY
@@ -145,6 +165,38 @@ def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig
     return rounds
 
 
+def _needed_rounds(
+    site: _Site, context: Sequence[int], config: CompletionConfig, size: int
+) -> tuple[list[PlannedRound], tuple[float, float]]:
+    """The views that show most of what the capture does not, none that adds too little: anchors, then rounds of what is left.
+
+    Also returns the shares of what surrounds the capture that are seen before and after.
+    """
+    half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
+    places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)))
+    chosen = choose_views(
+        places.coverage,
+        places.shown(half_angle),
+        most=config.most_anchors + config.densify_rounds * config.densify_views,
+        least_gain=config.least_gain,
+    )
+    taken = list(chosen.indices)
+    sizes = [config.most_anchors] + [config.densify_views] * config.densify_rounds
+    rounds, first = [], 0
+    for number, views in enumerate(sizes):
+        group = taken[first : first + views]
+        first += views
+        if not group:
+            continue
+        centers = places.centers[group]
+        targets = centers + places.looks[group] * max(site.shape.radius, 1.0)
+        new = Pinholes.looking_at(centers, targets, up=site.shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size)
+        new, seed = new.to(torch.float32), round_seed(config.seed, number)
+        role = ANCHOR if number == 0 else DENSIFY
+        rounds.append(PlannedRound(number=number, role=role, seed=seed, cameras=new, prompt=config.prompt))
+    return rounds, (1 - places.coverage.unseen_share, 1 - chosen.unseen_share)
+
+
 def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:
     """The views of a person's camera path, none of them moved: equally spaced ones first, as anchors, then what lies between.
 
@@ -152,9 +204,9 @@ def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:
     """
     assert config.camera_path is not None
     path = read_camera_path(config.camera_path, size=size)
-    most = config.anchor_views + config.densify_rounds * config.densify_views
+    most = config.most_anchors + config.densify_rounds * config.densify_views
     taken = strided_subset(len(path.cameras), most)
-    anchors = strided_subset(len(taken), config.anchor_views)
+    anchors = strided_subset(len(taken), config.most_anchors)
     rest = [index for place, index in enumerate(taken) if place not in set(anchors)]
     needed = -(-len(rest) // max(config.densify_views, 1))
     groups = [[taken[place] for place in anchors], *(rest[first::needed] for first in range(needed))]
@@ -220,7 +272,27 @@ class _Site:
         if placement.clearance == 0:
             return centers
         refuges = torch.cat([camera.centers for camera in self.cameras])
-        return kept_clear(centers, shell=self.shell, points=self.points, clearance=placement.clearance * typical, refuges=refuges)
+        return kept_clear(
+            centers, shell=self._bounds(refuges), points=self.points, clearance=placement.clearance * typical, refuges=refuges
+        )
+
+    def _bounds(self, standing: Float[Tensor, "n 3"]) -> Shell:
+        """What no new camera stands outside of: the shell, unless that is an object which the captured cameras stand around."""
+        if self.shape.outward or float(self.shell.contains(standing).double().mean()) > 0.5:
+            return self.shell
+        return sphere(self.shape.center, _BEYOND * float((standing - self.shape.center).norm(dim=1).max()))
+
+    def candidates(self, generator: torch.Generator) -> Candidates:
+        """Places and directions for new views, and what of the scene is seen."""
+        chosen = spread_subset(self.cameras, _CAPTURED_PLACES)
+        standing = torch.cat([self.cameras[index].centers for index in chosen])
+        around = [self.centers(role, _PLACES, generator) for role in (ANCHOR, DENSIFY)]
+        if self.shape.outward:
+            surface, directions = self.surface()
+            weight = 1.0 - 0.6 * (directions @ self.shape.up) ** 2  # as `need`
+            coverage = Coverage.of(self.cameras, surface, weight, self.known)
+            return looking_out(torch.cat([standing, *around]), self.shape, coverage, max_pitch_degrees=self.placement.max_pitch_degrees)
+        return looking_in(torch.cat(around), self.shape, self.cameras)
 
     def targets(
         self, centers: Float[Tensor, "n 3"], need: Float[Tensor, "k"], half_angle_radians: float, generator: torch.Generator

@@ -208,6 +208,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         else:
             plan = plan_completion(cameras, points, config, size=size, known=self.known_parts)
         done, _ = without_requested(self.generated_views)
+        if not plan.rounds and plan.covered is not None:
+            CONSOLE.print(announcement(plan, config, model))
         if plan.rounds:
             with refusing():
                 told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)

@@ -183,7 +183,7 @@ def arguments_of(method: str, folder: Path, room: int, config: Methods) -> list[
     if config.model is not None:
         completion["model"] = config.model.absolute()
     if config.quick:
-        completion |= {"steps": 2, "anchor-views": min(own.anchor_views, 2), "densify-rounds": 1, "densify-views": 2}
+        completion |= {"steps": 2, "anchor-views": min(own.most_anchors, 2), "densify-rounds": 1, "densify-views": 2}
     completion |= config.completion
     shared = training_arguments(folder.absolute(), "fillerbuster-none", seed=room, iterations=config.iterations, model=None)
     extra = (text for name, value in completion.items() for text in (f"--pipeline.datamanager.completion.{name}", str(value)))

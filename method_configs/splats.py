@@ -120,6 +120,7 @@ def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> Traine
         method_name,
         at_step=0,
         context_choice="stride",
+        anchor_views=24,
         densify_rounds=4,
         generated_share=0.5,
         generated_pixels="all",

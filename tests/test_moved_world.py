@@ -204,10 +204,11 @@ def test_where_new_cameras_stand_and_look(far) -> None:
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
 @pytest.mark.parametrize("inward", [False, True])
 @pytest.mark.parametrize("points", [True, False])
-def test_the_plan_of_a_completion(dtype, far, inward, points) -> None:
+@pytest.mark.parametrize("anchors", [5, None])
+def test_the_plan_of_a_completion(dtype, far, inward, points, anchors) -> None:
     here, there, shift, rounding = worlds(dtype, far, inward=inward)
     rounding = max(rounding, 4 * torch.finfo(torch.float32).eps * far)  # of the new cameras, which are float32
-    config = CompletionConfig(context_views=4, anchor_views=5, densify_rounds=2, densify_views=3, context_choice="overlap")
+    config = CompletionConfig(context_views=4, anchor_views=anchors, densify_rounds=2, densify_views=3, context_choice="overlap")
     plans = [
         plan_completion(single(cameras), (walls() + by).to(dtype) if points else None, config, size=16)
         for cameras, by in ((here, 0 * shift), (there, shift))

@@ -77,7 +77,14 @@ def test_the_papers_optimisation_differs_in_what_the_paper_says() -> None:
     optional = {"num_downscales": 0, "use_scale_regularization": True, "stop_split_at": steps, "stop_screen_size_at": steps}
     expected = {
         **{"start_points": 0, "load_3D_points": False, "random_init": True, "sh_degree": 0, "ssim_lambda": 0.0},
-        **{"at_step": 0, "context_choice": "stride", "densify_rounds": 4, "generated_share": 0.5, "generated_pixels": "all"},
+        **{
+            "at_step": 0,
+            "context_choice": "stride",
+            "anchor_views": 24,
+            "densify_rounds": 4,
+            "generated_share": 0.5,
+            "generated_pixels": "all",
+        },
         **{"match_colors": False, "seed_gaussians": False},
     }
     assert {name: value for name, value in changed.items() if name not in optional} == expected
