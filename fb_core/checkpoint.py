@@ -146,7 +146,7 @@ def _refuse_foreign(folder: Path) -> None:
 def _is_model(folder: Path) -> bool:
     """Whether a folder without a mark has a configuration of ours; other programs write files called config.json, too."""
     try:
-        told = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+        told = read_json(folder / CONFIG_FILE)
     except (OSError, ValueError):
         return False
     return isinstance(told, dict) and {"format_version", "transformer", "image_vae", "raymap_vae"} <= set(told)

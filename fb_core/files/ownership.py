@@ -81,14 +81,14 @@ def foreign_files(folder: Path) -> list[str]:
     """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no mark tells."""
     told = _mark(folder)
     own = told.get("files") if told is not None else None
-    return sorted(set(_files(folder)) - set(own)) if isinstance(own, list) else []
+    return sorted(set(_files(folder)) - {name for name in own if isinstance(name, str)}) if isinstance(own, list) else []
 
 
 def _mark(folder: Path) -> dict | None:
     path = folder / MARK_NAME
     try:
         told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return told if isinstance(told, dict) and told.get("made_by") == _MADE_BY else None
 
