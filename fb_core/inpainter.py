@@ -34,7 +34,8 @@ _FARTHEST = {"pixels": 1e4, "rays": 1e12}  # known values beyond are no colours 
 _logger = logging.getLogger(__name__)
 
 
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 def _in_own_precision(method: Callable[Concatenate[Fillerbuster, _P], _R]) -> Callable[Concatenate[Fillerbuster, _P], _R]:

@@ -38,8 +38,9 @@ def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: floa
     if not 0 < start <= 1:
         raise ValueError(f"start: expected a time above 0 and at most 1, got {start}")
     whole = reference_grid(steps) if grid == "reference" else [1.0 - k / steps for k in range(steps + 1)]
-    times = [shift * t / (1.0 + (shift - 1.0) * t) for t in whole]
-    if any(later >= earlier for earlier, later in itertools.pairwise(times)):
+    first = 1.0 + (shift - 1.0)  # 0 where a shift is too small beside 1, and the first time has no value
+    times = [shift * t / (1.0 + (shift - 1.0) * t) for t in whole] if first > 0 else []
+    if not times or any(later >= earlier for earlier, later in itertools.pairwise(times)):
         raise ValueError(f"time shift: {shift:g} leaves steps without length; choose one nearer to 1")
     way, ends = [], sorted({time for time in through if 0 < time < start}, reverse=True)
     for begin, end in itertools.pairwise([start, *ends, 0.0]):
