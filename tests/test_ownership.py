@@ -300,3 +300,13 @@ def test_saving_a_model_survives_that_its_second_rename_fails(tmp_path: Path, mo
         save_tiny_model(model, seed=2)
     assert model_hash(model) == before and [path.name for path in tmp_path.iterdir()] == ["model"]
     assert checkpoint.load(model).info["preset"] == "random"
+
+
+def test_a_place_by_way_of_a_missing_folder_is_the_place_that_is_there(tmp_path: Path):
+    there = marked(tmp_path / "capture", "capture")
+    before = files(there)
+    for overwrite in (False, True):
+        target = Target(folder=tmp_path / "missing" / ".." / "capture", kind="export", overwrite=overwrite, inputs=(there,))
+        with pytest.raises(ValueError, match="capture"), whole_folder(target):
+            pass
+    assert files(there) == before and [path.name for path in tmp_path.iterdir()] == ["capture"]
