@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -28,7 +30,23 @@ from fb_core.sampling.trajectory import OnStep, SamplingInterrupted
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
+_FARTHEST = {"pixels": 1e4, "rays": 1e12}  # known values beyond are no colours or places, and their squares would overflow
 _logger = logging.getLogger(__name__)
+
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def _in_own_precision(method: Callable[Concatenate[Fillerbuster, _P], _R]) -> Callable[Concatenate[Fillerbuster, _P], _R]:
+    """Keep a caller's autocast out: what is computed in which precision is said by the model and by the sampling options."""
+
+    @functools.wraps(method)
+    def called(self: Fillerbuster, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with torch.autocast(self.device.type, enabled=False):
+            return method(self, *args, **kwargs)
+
+    return called
 
 
 class Fillerbuster:
@@ -104,6 +122,7 @@ class Fillerbuster:
         return estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
 
     @torch.no_grad()
+    @_in_own_precision
     def complete(
         self,
         views: Views,
@@ -134,8 +153,8 @@ class Fillerbuster:
         Raises:
             SamplingInterrupted: a KeyboardInterrupt while denoising. Model and arguments are as they were; the error holds the trajectory
                 as far as it got, for `resume`.
-            ValueError: for no views, views that are too small, known pixels or rays that are not finite, a prompt that the model cannot
-                read, or too little memory however the work is cut (saying what would fit).
+            ValueError: for no views, views that are too small, pixels or rays in integers, known ones that are not finite or far out of
+                range, a prompt that the model cannot read, or too little memory however the work is cut (saying what would fit).
         """
         _check(views)
         sampling = self.recommended_sampling if sampling is None else sampling
@@ -214,6 +233,7 @@ class Fillerbuster:
         _logger.debug("%d views of %dx%d: %.2f GiB, %s", views, size[1], size[0], expected.peak / 2**30, expected.cut)
         return expected.cut
 
+    @_in_own_precision
     def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig | None = None) -> Denoising:
         """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
         _check(views)
@@ -308,9 +328,14 @@ def _check(views: Views) -> None:
     for what, values, known in (("pixels", views.images, views.image_known), ("rays", views.raymaps, views.rays_known)):
         if not bool(torch.isfinite(known).all()) or float(known.min()) < 0 or float(known.max()) > 1:
             raise ValueError(f"complete: the mask of known {what} must lie in [0, 1] (1 = known)")
+        if not values.is_floating_point():
+            raise ValueError(f"complete: expected {what} in floating-point numbers, got {values.dtype}; colours are in [0, 1]")
         broken = int(((~torch.isfinite(values)) & (known > 0)).any(dim=1).sum())
         if broken:
             raise ValueError(f"complete: {broken} known {what} are NaN or infinite; mark them as unknown (mask 0) or repair them")
+        far = int(((values.abs() > _FARTHEST[what]) & (known > 0)).any(dim=1).sum())
+        if far:
+            raise ValueError(f"complete: {far} known {what} are beyond {_FARTHEST[what]:g}; mark them as unknown (mask 0) or scale them")
 
 
 def _check_current(current: Views, views: Views) -> None:

@@ -6,6 +6,7 @@ The numbers are far above all that cameras, films and models have, and far below
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Mapping
 from typing import Any
 
@@ -47,6 +48,13 @@ def require_between(name: str, value: float, least: float, most: float) -> None:
     """Raise a ValueError unless ``least <= value <= most`` (NaN is not)."""
     if not least <= value <= most:
         raise ValueError(f"{name}: expected {least:g} to {most:g}, got {_short(value)}")
+
+
+def require_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise a ValueError unless ``value`` is an integer (no truth value) with ``least <= value <= most``."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise ValueError(f"{name}: expected a whole number, got {value!r:.40}")
+    require_between(name, int(value), least, most)
 
 
 def require_model_sizes(sizes: Mapping[str, Any]) -> None:

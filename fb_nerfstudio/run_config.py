@@ -38,6 +38,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
 }
 """All that a tag may name, by modules. nerfstudio's minimal-parser is left out on purpose, since it unpickles the data that it reads."""
 _PATHS = ("pathlib.PosixPath", "pathlib.WindowsPath", "pathlib.PurePosixPath", "pathlib.Path", "pathlib._local.PosixPath")
+_MOST_BYTES = 2**22  # a run's options have some 10 KiB
 _TAG = "tag:yaml.org,2002:python/"
 
 
@@ -53,10 +54,12 @@ def read_run_config(path: Path) -> Any:
     from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise _Refused(f"it has more than {_MOST_BYTES // 2**20} MiB, which no options have")
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # our loader, which builds nothing but what is listed
     except _Refused as error:
         raise ValueError(f"{path}: {error}; nothing of it was executed, so ask where this run comes from") from None
-    except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not readable as a run's options ({' '.join(str(error).split())[:200]}); restore it") from None
     if not isinstance(config, FillerbusterTrainerConfig):
         raise ValueError(f"{path}: expected the options of a fillerbuster run, got {type(config).__name__}; give a run of ours")
@@ -65,6 +68,11 @@ def read_run_config(path: Path) -> Any:
 
 class _Loader(yaml.SafeLoader):
     """Plain YAML, tuples, paths, and the classes in ``ALLOWED``."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merged mappings (``<<``), which no run writes, are refused: a few lines of them grow without bound."""
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise _Refused("it merges mappings (<<), which no run of fillerbuster does")
 
 
 def _named(tag: str, name: str) -> type:
@@ -96,6 +104,11 @@ def _object(loader: _Loader, name: str, node: yaml.Node) -> Iterator[Any]:
         if not isinstance(key, str) or (key not in fields and hasattr(kind, key)) or key.startswith("__"):
             raise _Refused(f"the tag {node.tag!r} gives {str(key)[:40]!r}, which is none of its options")
     vars(made).update(values)
+    for one in dataclasses.fields(kind):  # options that are newer than the run, or were taken out
+        if one.name not in values and not hasattr(kind, one.name):
+            if one.default_factory is dataclasses.MISSING:
+                raise _Refused(f"the tag {node.tag!r} lacks {one.name!r}, which has no default")
+            setattr(made, one.name, one.default_factory())
 
 
 def _applied(loader: _Loader, name: str, node: yaml.Node) -> Any:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.limits import MOST_PIXELS
 from fb_nerfstudio.single_thread import single_thread
 from fb_nerfstudio.torch_cells import CELL_WIDTH, CellGrid, Ellipses, tile_bounds
 from fb_nerfstudio.torch_compositing import CompositingSettings, composite
@@ -81,6 +82,7 @@ def rasterization(
     """
     _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgrounds, sh_degree, render_mode)
     _check_options(width, height, packed, tile_size, rasterize_mode, semantics)
+    _check_numbers(viewmats.shape[0] * width * height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d)
     settings = ProjectionSettings(
         width=width,
         height=height,
@@ -267,7 +269,19 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgr
         _expect("backgrounds", backgrounds, (cameras, colors.shape[-1]), means)
 
 
+def _check_numbers(pixels: int, **numbers: float) -> None:
+    if pixels > MOST_PIXELS:
+        raise ValueError(f"the pictures should have at most {MOST_PIXELS} pixels together but have {pixels}: draw fewer or smaller ones.")
+    for name, number in numbers.items():
+        if math.isnan(number):
+            raise ValueError(f"{name} should be a number but is NaN.")
+    if not 0 <= numbers["eps2d"] < math.inf:
+        raise ValueError(f"eps2d should be finite and not negative but is {numbers['eps2d']}.")
+
+
 def _check_options(width: int, height: int, packed: bool, tile_size: int, rasterize_mode: str, semantics: str) -> None:
+    if not isinstance(width, int) or not isinstance(height, int):
+        raise ValueError(f"width and height should be whole numbers but are {width!r} and {height!r}.")
     if width < 1 or height < 1:
         raise ValueError(f"width and height should be at least 1 but are {width} and {height}.")
     if packed:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jaxtyping
 import pytest
 import torch
 from tiny_models import tiny_model
@@ -144,12 +145,51 @@ def test_bad_views_are_refused_with_one_sentence(model):
         model.complete(dataclasses.replace(views, images=broken), generator=seeded())
     with pytest.raises(ValueError, match="must lie in"):
         model.complete(dataclasses.replace(views, image_known=views.image_known * 2), generator=seeded())
+    for far in ({"images": views.images * 1e30}, {"raymaps": views.raymaps * 1e30}):  # their squares are infinite, the answer was NaN
+        with pytest.raises(ValueError, match="are beyond"):
+            model.complete(dataclasses.replace(views, **far), generator=seeded())
+
+
+def test_pixels_in_integers_are_refused(model, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # users run without the tests' type checks
+    views = mixed_views()
+    with pytest.raises(ValueError, match=r"pixels in floating-point numbers, got torch\.uint8"):
+        model.complete(dataclasses.replace(views, images=(255 * views.images).to(torch.uint8)), generator=seeded())
+
+
+def test_a_caller_s_autocast_changes_not_a_bit():
+    bundled, views = Fillerbuster.from_pretrained(), mixed_views()
+    wanted = bundled.complete(views, generator=seeded(), sampling=QUICK)
+    with torch.autocast("cpu", torch.bfloat16):
+        got = bundled.complete(views, generator=seeded(), sampling=QUICK)
+        assert torch.is_autocast_enabled("cpu")
+    assert torch.equal(got.images, wanted.images) and torch.equal(got.raymaps, wanted.raymaps)
 
 
 @pytest.mark.parametrize("nonsense", [{"steps": 0}, {"solver": "magic"}, {"rounds": 0}, {"views_at_once": 0}, {"shift": -1.0}])
 def test_nonsense_sampling_is_refused(nonsense):
     with pytest.raises(ValueError, match="expected"):
         SamplingConfig(**nonsense)
+
+
+@pytest.mark.parametrize("name", ["steps", "rounds", "window", "views_at_once"])
+@pytest.mark.parametrize("value", [2.5, 2.0, True, "3"])
+def test_counts_of_a_sampling_are_whole_numbers(name, value, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(ValueError, match="expected a whole number, got"):
+        SamplingConfig(**{name: value})
+
+
+@pytest.mark.parametrize("shift", [1e30, 1e-323])
+def test_a_shift_that_leaves_steps_without_length_is_refused(shift):
+    with pytest.raises(ValueError, match="leaves steps without length"):
+        SamplingConfig(shift=shift)
+    assert len(set(SamplingConfig(shift=1000.0).times)) == 25
+
+
+def test_guidance_that_overflows_is_refused():
+    with pytest.raises(ValueError, match="guidance_unknown: expected -1000 to 1000"):
+        SamplingConfig(guidance_unknown=1e30)
 
 
 # Options of sampling -----------------------------------------------------------------------------------------------

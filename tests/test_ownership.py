@@ -12,7 +12,7 @@ from tiny_models import save_tiny_model
 
 from fb_core import checkpoint
 from fb_core.checkpoint import model_hash
-from fb_core.files.ownership import MARK_NAME, Target, kind_of
+from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of
 from fb_core.files.whole import whole_folder
 from fb_nerfstudio.completed_views import views_target
 from fb_nerfstudio.datamanager import FillerbusterDataManager
@@ -90,7 +90,13 @@ def test_links_are_neither_followed_nor_replaced(tmp_path: Path, leads_to: str):
 
 
 def test_only_the_same_kind_with_a_mark_of_ours_is_replaced(tmp_path: Path):
-    for name, text in (("none", None), ("other", '{"made_by": "others", "kind": "export"}'), ("torn", '{"made_by"'), ("list", "[1]")):
+    for name, text in (
+        ("none", None),
+        ("other", '{"made_by": "others", "kind": "export"}'),
+        ("torn", '{"made_by"'),
+        ("list", "[1]"),
+        ("deep", "[" * 200000),
+    ):
         folder = tmp_path / name
         folder.mkdir()
         (folder / "transforms.json").write_text("{}")
@@ -101,6 +107,9 @@ def test_only_the_same_kind_with_a_mark_of_ours_is_replaced(tmp_path: Path):
     with pytest.raises(ValueError, match="something else than an earlier export"):
         Target(folder=marked(tmp_path / "room", "capture"), kind="export", overwrite=True).check()
     Target(folder=marked(tmp_path / "ours", "export"), kind="export", overwrite=True).check()
+    odd = marked(tmp_path / "odd", "export")
+    (odd / MARK_NAME).write_text('{"made_by": "fillerbuster", "kind": "export", "files": [["note.txt"], {}, 3]}')
+    assert foreign_files(odd) == ["note.txt"]  # names that are none name nothing
     (tmp_path / "copied mark").mkdir()
     (tmp_path / "copied mark" / MARK_NAME).symlink_to(tmp_path / "ours" / MARK_NAME)
     with pytest.raises(ValueError, match="something else than an earlier export"):
@@ -291,3 +300,13 @@ def test_saving_a_model_survives_that_its_second_rename_fails(tmp_path: Path, mo
         save_tiny_model(model, seed=2)
     assert model_hash(model) == before and [path.name for path in tmp_path.iterdir()] == ["model"]
     assert checkpoint.load(model).info["preset"] == "random"
+
+
+def test_a_place_by_way_of_a_missing_folder_is_the_place_that_is_there(tmp_path: Path):
+    there = marked(tmp_path / "capture", "capture")
+    before = files(there)
+    for overwrite in (False, True):
+        target = Target(folder=tmp_path / "missing" / ".." / "capture", kind="export", overwrite=overwrite, inputs=(there,))
+        with pytest.raises(ValueError, match="capture"), whole_folder(target):
+            pass
+    assert files(there) == before and [path.name for path in tmp_path.iterdir()] == ["capture"]

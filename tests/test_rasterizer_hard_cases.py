@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 
+import jaxtyping
 import pytest
 import torch
 from torch import Tensor
@@ -208,3 +209,21 @@ def test_gaussians_that_reach_no_pixel_get_no_gradient(changes):
     images, alphas, _, gradients = draw(splats(1, **changes), rasterize_mode="classic")
     assert float(alphas.max()) == 0 and float(images[..., :3].abs().max()) == 0
     assert all(float(gradients[name].abs().max()) == 0 for name in ("means", "scales", "opacities"))
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize("option", [{"near_plane": NAN}, {"far_plane": NAN}, {"radius_clip": NAN}, {"eps2d": NAN}, {"eps2d": -1.0}])
+def test_options_that_are_no_numbers_are_refused(option: dict):
+    with pytest.raises(ValueError, match=f"{next(iter(option))} should be"):
+        rasterization(**splats(), **option)
+
+
+@pytest.mark.parametrize(
+    ("size", "told"), [({"width": 24.5}, "whole numbers"), ({"width": 2**20, "height": 2**20}, "at most 268435456 pixels")]
+)
+def test_sizes_that_no_picture_has_are_refused_before_anything_is_allocated(size: dict, told: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(ValueError, match=told):
+        rasterization(**{**splats(), **size})

@@ -16,6 +16,7 @@ from nerfstudio.plugins.registry import discover_methods
 from test_export import generated_views, make_run
 
 from fb_nerfstudio.run_config import ALLOWED, read_run_config
+from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs import commands
 from method_configs.splats import fillerbuster
 
@@ -105,7 +106,24 @@ def test_the_marker_would_be_left_by_nerfstudios_loader(tmp_path: Path):
     assert (tmp_path / "executed").exists()
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "\x00", "- " * 5000, "&a [*a]", "? {}\n: 1"])
+BROKEN_SCALARS = ("a: !!int ''", "a: !!int '_'", "a: !!bool maybe", "a: !!float ''", "a: !!timestamp soon")
+"""At these PyYAML itself stumbles: errors of four kinds that are no YAMLError."""
+
+
+def test_a_config_that_grows_without_bound_is_refused_at_once(tmp_path: Path):
+    bomb = "a0: &a0 {k: v}\n" + "".join(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}\n" for i in range(1, 12))
+    for text, told in ((bomb, "merges mappings"), ("a: " + "x" * 2**23, "more than 4 MiB")):
+        (tmp_path / "config.yml").write_text(text)
+        with pytest.raises(ValueError, match=told):
+            read_run_config(tmp_path / "config.yml")
+
+
+def test_options_that_a_config_leaves_out_have_their_defaults(tmp_path: Path):
+    (tmp_path / "config.yml").write_text("!!python/object:fb_nerfstudio.trainer.FillerbusterTrainerConfig\nmax_num_iterations: 3\n")
+    assert read_run_config(tmp_path / "config.yml") == FillerbusterTrainerConfig(max_num_iterations=3)
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "\x00", "- " * 5000, "&a [*a]", "? {}\n: 1", *BROKEN_SCALARS])
 def test_what_is_no_config_is_one_sentence(tmp_path: Path, tiny_capture: Path, capsys, text: str):
     run = make_run(tmp_path / "run", tiny_capture, generated_views())
     (run / "config.yml").write_text(text)

@@ -267,3 +267,16 @@ def test_an_error_of_another_kind_passes_unchanged(tmp_path: Path):
     with pytest.raises(CannotWrite, match=r"cannot write .*/a: No space left on device; free some room"), whole_file(tmp_path / "a"):
         raise RuntimeError("a library's own words") from OSError(errno.ENOSPC, "No space left on device")
     assert names(tmp_path) == []
+
+
+def test_a_file_by_way_of_a_missing_folder_is_the_file_that_is_there(tmp_path: Path):
+    """A link stays and nothing is made on the way."""
+    precious, link = tmp_path / "precious.png", tmp_path / "sheet.png"
+    precious.write_text("precious")
+    link.symlink_to(precious)
+    with pytest.raises(CannotWrite, match="a link or a folder"), whole_file(tmp_path / "missing" / ".." / "sheet.png") as unfinished:
+        unfinished.write_text("new")
+    assert link.is_symlink() and precious.read_text() == "precious"
+    with whole_file(tmp_path / "missing" / ".." / "precious.png") as unfinished:
+        unfinished.write_text("new")
+    assert precious.read_text() == "new" and sorted(path.name for path in tmp_path.iterdir()) == ["precious.png", "sheet.png"]

@@ -33,7 +33,7 @@ class Target:
 
     def check(self) -> None:
         """Raises ValueError in one sentence for a folder that must not be written. Links are neither followed nor replaced."""
-        folder = self.folder
+        folder = real_place(self.folder)  # what is written: "missing/.." leads somewhere though the system does not find it yet
         if folder.is_symlink():
             raise ValueError(f"{folder} is a link, which is neither followed nor replaced; choose another folder")
         if not folder.exists():
@@ -81,14 +81,14 @@ def foreign_files(folder: Path) -> list[str]:
     """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no mark tells."""
     told = _mark(folder)
     own = told.get("files") if told is not None else None
-    return sorted(set(_files(folder)) - set(own)) if isinstance(own, list) else []
+    return sorted(set(_files(folder)) - {name for name in own if isinstance(name, str)}) if isinstance(own, list) else []
 
 
 def _mark(folder: Path) -> dict | None:
     path = folder / MARK_NAME
     try:
         told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return told if isinstance(told, dict) and told.get("made_by") == _MADE_BY else None
 
@@ -100,6 +100,11 @@ def _files(folder: Path) -> list[str]:
         links = [name for name in folders if os.path.islink(os.path.join(where, name))]
         found += [Path(where, name).relative_to(folder).as_posix() for name in (*files, *links)]
     return [name for name in found if name != MARK_NAME]
+
+
+def real_place(folder: Path) -> Path:
+    """The folder with the links of all folders above it followed; its own name stays, link or not."""
+    return Path(os.path.realpath(folder)) if folder.name in ("", "..") else Path(os.path.realpath(folder.parent)) / folder.name
 
 
 def _is_or_holds(folder: Path, other: Path) -> bool:

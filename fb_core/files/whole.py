@@ -30,7 +30,7 @@ except ImportError:  # no system with such locks; what killed processes leave th
     fcntl = None
 
 from fb_core.files.faults import CannotWrite, all_told, telling
-from fb_core.files.ownership import Target, foreign_files, write_mark
+from fb_core.files.ownership import Target, foreign_files, real_place, write_mark
 
 _OWNER, _NEW, _OLD, _GONE = "owner", "new", "old", "gone"
 _OWNER_TEXT = "fillerbuster writes here; the folder may be removed once no fillerbuster runs\n"
@@ -50,7 +50,7 @@ def whole_folder(target: Target) -> Iterator[Path]:
     Raises ValueError for a target that must not be written (before the block, and again after it, for a long time may have passed), and
     CannotWrite in one sentence when the disk is full or cannot be written.
     """
-    folder = _real(target.folder)
+    folder = real_place(target.folder)
     settled(folder)
     target.check()
     with unfinished_beside(folder) as work:
@@ -71,7 +71,7 @@ def whole_file(path: str | os.PathLike[str], *, durable: bool = False) -> Iterat
 
     ``durable``: also when the power fails. Pipes and devices are written as they are. Raises CannotWrite in one sentence.
     """
-    path = Path(path)
+    path = real_place(Path(path))  # "missing/.." leads somewhere though the system does not find it yet
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
@@ -128,7 +128,7 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
 
 def remove_folder(target: Target) -> None:
     """Take away an earlier folder of the target's kind, if there is one, in one step. Raises as :func:`whole_folder`."""
-    folder = _real(target.folder)
+    folder = real_place(target.folder)
     settled(folder)
     target.check()
     if folder.exists():
@@ -294,8 +294,3 @@ def _mend(work: Path, path: Path) -> None:
                 entry.unlink()
         (work / _OWNER).unlink()  # last: without it nobody would know whose the rest is
         work.rmdir()
-
-
-def _real(folder: Path) -> Path:
-    """The folder with the links of all folders above it followed; its own name stays, link or not."""
-    return Path(os.path.realpath(folder)) if folder.name in ("", "..") else Path(os.path.realpath(folder.parent)) / folder.name

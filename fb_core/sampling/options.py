@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from fb_core.limits import MOST_SAMPLING_STEPS, is_finite, require_between
+from fb_core.limits import MOST_SAMPLING_STEPS, is_finite, require_between, require_whole
 from fb_core.networks.precision import PRECISIONS, Precision
 from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.sampling.solvers import SOLVERS
@@ -17,6 +17,7 @@ Guess = Literal["start", "told", "both"]
 """How a guess of what is to be generated enters."""
 POSE_STEPS, POSE_WINDOW = 8, 8
 """Steps that raymaps need, and views per window."""
+_MOST_GUIDANCE = 1000.0  # the paper's largest is 10; far beyond, latents overflow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +79,16 @@ class SamplingConfig:
             raise ValueError(f"belief: expected a number between 0 and 1, got {self.belief}; what is certain is known, not guessed")
         if self.known not in ("guided", "imposed"):
             raise ValueError(f"known: expected 'guided' or 'imposed', got {self.known!r}")
-        for name in ("rounds", "views_at_once", "window", "memory_budget_bytes"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
-        require_between("rounds", self.rounds, 1, MOST_SAMPLING_STEPS)
+        require_whole("rounds", self.rounds, 1, MOST_SAMPLING_STEPS)
+        for name in ("views_at_once", "window"):
+            if getattr(self, name) is not None:
+                require_whole(name, getattr(self, name), 1, 2**62)
+        if self.memory_budget_bytes is not None and not self.memory_budget_bytes >= 1:
+            raise ValueError(f"memory_budget_bytes: expected at least 1, got {self.memory_budget_bytes}")
         for name in ("guidance_unknown", "guidance_known", "guidance_text"):
             if not is_finite(getattr(self, name)):
                 raise ValueError(f"{name}: expected a finite number, got {getattr(self, name)!r}")
+            require_between(name, getattr(self, name), -_MOST_GUIDANCE, _MOST_GUIDANCE)
 
     @property
     def times(self) -> list[float]:

@@ -6,10 +6,9 @@ The best grid depends on the flow (docs/speed_and_accuracy.md), so it is an opti
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable
 
-from fb_core.limits import MOST_SAMPLING_STEPS, require_between
+from fb_core.limits import MOST_SAMPLING_STEPS, is_finite, require_whole
 
 GRIDS = ("even", "reference")
 REFERENCE_LAST = 0.001
@@ -28,17 +27,21 @@ def time_grid(steps: int, *, shift: float = 1.0, grid: str = "even", start: floa
         through: times that must be among them, such as those where the velocity jumps; from the last of them on the times are those
             of a sampling that starts there. What is not between `start` and 0 does not count.
 
-    Raises ValueError for no steps, a shift that is not positive, an unknown grid and a start outside (0, 1].
+    Raises ValueError for no steps, a shift that is not positive or so far from 1 that steps vanish, an unknown grid, and a start
+    outside (0, 1].
     """
-    require_between("sampling steps", steps, 1, MOST_SAMPLING_STEPS)
-    if not 0 < shift < math.inf:
+    require_whole("sampling steps", steps, 1, MOST_SAMPLING_STEPS)
+    if not is_finite(shift) or shift <= 0:
         raise ValueError(f"time shift: expected a positive number, got {shift}")
     if grid not in GRIDS:
         raise ValueError(f"time grid: expected one of {', '.join(GRIDS)}, got {grid!r}")
     if not 0 < start <= 1:
         raise ValueError(f"start: expected a time above 0 and at most 1, got {start}")
     whole = reference_grid(steps) if grid == "reference" else [1.0 - k / steps for k in range(steps + 1)]
-    times = [shift * t / (1.0 + (shift - 1.0) * t) for t in whole]
+    first = 1.0 + (shift - 1.0)  # 0 where a shift is too small beside 1, and the first time has no value
+    times = [shift * t / (1.0 + (shift - 1.0) * t) for t in whole] if first > 0 else []
+    if not times or any(later >= earlier for earlier, later in itertools.pairwise(times)):
+        raise ValueError(f"time shift: {shift:g} leaves steps without length; choose one nearer to 1")
     way, ends = [], sorted({time for time in through if 0 < time < start}, reverse=True)
     for begin, end in itertools.pairwise([start, *ends, 0.0]):
         way += _before(end, _from(begin, times))
