@@ -22,16 +22,13 @@ class Bank:
     cameras: Cameras
     """Theirs, on the training's device and without ``cam_idx``."""
     shares: tuple[float, ...]
-    """Of each view, the share of its pixels that is trained on."""
+    """Of each view, the share of its pixels that is trained on, times how far it is believed."""
 
     @staticmethod
     def of(views: CompletedViews, device: torch.device | str) -> Bank:
         """The bank of these views."""
-        return Bank(
-            views=views,
-            cameras=to_nerfstudio(views.cameras, device),
-            shares=tuple(views.masks.double().mean(dim=(1, 2, 3)).tolist()),
-        )
+        shares = views.masks.double().mean(dim=(1, 2, 3)) * torch.tensor([origin.trust for origin in views.origins], dtype=torch.float64)
+        return Bank(views=views, cameras=to_nerfstudio(views.cameras, device), shares=tuple(shares.tolist()))
 
     def probability(self, *, most: float, captured: int) -> float:
         """Probability that a step draws from the bank: ``most``, or less where that would draw its views more often than captured ones."""
@@ -46,7 +43,8 @@ class Bank:
         return int(draws.choice(len(self.views), p=np.array(self.shares) / sum(self.shares)))
 
     def batch(self, index: int, *, as_float: bool, weight: float) -> tuple[Cameras, dict[str, Any]]:
-        """Camera and batch of one view on the training's device; ``weight`` is that of its loss."""
+        """Camera and batch of one view on the training's device; ``weight`` is that of a view's loss that is wholly believed."""
+        weight *= self.views.origins[index].trust
         device, image = self.cameras.device, self.views.images[index]
         image = (image.float() / 255 if as_float else image).to(device)
         return self.cameras[index : index + 1], {"image": image, "mask": self.views.masks[index].to(device), "view_weight": weight}

@@ -67,7 +67,7 @@ def _fitted(picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int) -> tup
 def _origin(frame: Frame, number: int) -> Origin:
     """What the frame says of its own origin, as far as it does."""
     told = frame.extra
-    seed, aspect = told.get("seed"), told.get("aspect")
+    seed, aspect, trust = told.get("seed"), told.get("aspect"), told.get("trust")
     return Origin(
         role=BROUGHT,
         round=number,
@@ -75,4 +75,5 @@ def _origin(frame: Frame, number: int) -> Origin:
         prompt=str(told.get("prompt") or ""),
         model_hash=str(told.get("model_hash") or ""),
         aspect=float(aspect) if isinstance(aspect, int | float) else frame.camera.width / frame.camera.height,
+        trust=float(trust) if isinstance(trust, int | float) and 0 <= trust <= 1 else 1.0,
     )

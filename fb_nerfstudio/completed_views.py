@@ -49,10 +49,14 @@ class Origin:
     """Content hash of the diffusion weights."""
     aspect: float = 1.0
     """Width over height of the part of the square view that may be trained on; the rest is margin."""
+    trust: float = 1.0
+    """How far the view is believed, from 0 to 1: its loss counts so much of a photo's, and it is drawn so much more seldom."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", self.role) or not isinstance(self.round, int):  # files are named after them
             raise ValueError(f"Origin: expected a role of letters and the number of a round, got {self.role[:40]!r} and {self.round!r}")
+        if not 0 <= self.trust <= 1:
+            raise ValueError(f"Origin: expected a trust from 0 to 1, got {self.trust}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +92,12 @@ class CompletedViews:
             cameras=self.cameras[index],
             origins=tuple(self.origins[i] for i in index),
         )
+
+    def believed(self, trust: float | None) -> CompletedViews:
+        """The same views, believed so far; None leaves them as they are."""
+        if trust is None:
+            return self
+        return dataclasses.replace(self, origins=tuple(dataclasses.replace(origin, trust=trust) for origin in self.origins))
 
     @property
     def rounds(self) -> list[int]:

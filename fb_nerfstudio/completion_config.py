@@ -124,6 +124,8 @@ class CompletionConfig:
     """Shift the colours of generated views smoothly so that they meet the splats' where the capture has seen them."""
     view_weight: float = 1.0
     """Weight of a generated view's loss; captured views have 1."""
+    trust: Literal["full", "measured"] = "full"
+    """Count generated views in full, or as far as the model is right about a few captured views that are hidden from it first."""
     seed_gaussians: bool = True
     """Add Gaussians for generated pixels where the capture has seen nothing."""
     max_seed_gaussians: int = 20000

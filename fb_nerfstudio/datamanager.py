@@ -48,6 +48,7 @@ from fb_nerfstudio.requests import (
     without_view,
 )
 from fb_nerfstudio.start_points import start_points
+from fb_nerfstudio.trust import measured_trust
 from fb_nerfstudio.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
 from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
@@ -106,6 +107,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: Bank | None = None
         self._finished = False
+        self._trust: float | None = None  # in the model on this capture, once it is measured
         self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
 
     def _find_start_points(self) -> None:
@@ -219,9 +221,13 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             context = LazyViews(lambda index: self.captured_view(index, cameras[index]), plan.context)
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))
             with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
+                if config.trust == "measured" and not inpaints and self._trust is None:
+                    trust = measured_trust([*context], model, config, size=size, on_step=bars.trial)
+                    self._trust = trust.value
+                    CONSOLE.print(trust.in_words)
                 for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
                     left -= 1
-                    self._set_bank(merged(self.generated_views, (), views))
+                    self._set_bank(merged(self.generated_views, (), views.believed(self._trust)))
                     if left > 0:
                         save_checkpoint(trainer, step)
         del model
@@ -301,7 +307,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         release_memory()
         if self.generated_views is not None and planned.replaces:
             self._forget(self.generated_views[planned.replaces], planned.done, cameras, attributes)
-        new, added = self._fitted_in(new, attributes, scene.shell, cameras, step, holes_only=True)
+        new, added = self._fitted_in(new.believed(self._trust), attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
         said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
@@ -388,6 +394,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             "views": None if self.generated_views is None else self.generated_views.state(),
             "finished": self._finished,
             "outdated": list(self._outdated),
+            "trust": self._trust,
             "start_points": self._own_points,
             "captured_draws": self.captured_draws,
         }
@@ -397,6 +404,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._finished = bool(state["finished"])
         self.captured_draws = int(state["captured_draws"])
         self._outdated = [int(number) for number in state.get("outdated", ())]
+        self._trust = None if state.get("trust") is None else float(state["trust"])
         if state.get("start_points") is not None:  # not triangulated again: interrupted rounds are planned from the very same points
             self._own_points = state["start_points"].cpu()
             self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points

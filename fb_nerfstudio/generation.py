@@ -75,6 +75,14 @@ class Bars:
         self._progress.stop()
         self._panel.report("")
 
+    def trial(self, done: int, steps: int) -> None:
+        """Called by the sampler while the model is tried on hidden views."""
+        title = "Trying the model on hidden views"
+        if -1 not in self._tasks:
+            self._tasks[-1] = self._progress.add_task(title, total=steps)
+        self._progress.update(self._tasks[-1], completed=done)
+        self._panel.report(f"{title}, step {done} of {steps}", share=done / steps)
+
     def step(self, planned: PlannedRound, done: int, steps: int) -> None:
         """Called by the sampler after each denoising step."""
         title = f"{round_title(planned.role, planned.number)}: {len(planned.cameras)} views"

@@ -84,7 +84,7 @@ def _trainer() -> TrainerConfig:
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
                 # Splats of some hundred steps tell what is seen better than the cameras alone; captured views stay in the majority.
-                completion=CompletionConfig(at_step=500, generated_share=0.3),
+                completion=CompletionConfig(at_step=500, generated_share=0.3, trust="measured"),
             ),
             model=_model(),
         ),
@@ -121,6 +121,7 @@ def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> Traine
         at_step=0,
         context_choice="stride",
         anchor_views=24,
+        trust="full",
         densify_rounds=4,
         generated_share=0.5,
         generated_pixels="all",
@@ -151,12 +152,12 @@ fillerbuster_paper = MethodSpecification(
 fillerbuster_cat3d_size = MethodSpecification(
     # No anchors: CAT3D's model has no room for them beside its conditioning.
     config=with_completion(
-        fillerbuster.config, "fillerbuster-cat3d-size", context_views=3, anchor_views=0, densify_rounds=20, densify_views=6
+        fillerbuster.config, "fillerbuster-cat3d-size", context_views=3, anchor_views=0, densify_rounds=20, densify_views=6, trust="full"
     ),
     description="The paper's baseline with CAT3D's sequence size: 3 conditioning views, 20 rounds of 6 new ones.",
 )
 fillerbuster_masked = MethodSpecification(
-    config=with_completion(fillerbuster.config, "fillerbuster-masked", task="inpaint", at_step=0, seed_gaussians=False),
+    config=with_completion(fillerbuster.config, "fillerbuster-masked", task="inpaint", at_step=0, seed_gaussians=False, trust="full"),
     description="Inpaint what masks leave unknown in 32 captured views, together and once, then train splats (NeRFiller's protocol).",
 )
 nerfiller_grid = MethodSpecification(

@@ -126,6 +126,22 @@ def generated(manager: FillerbusterDataManager, folder: Path | None = None, step
     return attrs
 
 
+def test_the_model_is_tried_once_and_views_are_believed_accordingly(tiny_capture, tmp_path, capsys):
+    manager = make(tiny_capture, options(context_views=4, trust="measured"))
+    generated(manager, tmp_path)
+    trust = {origin.trust for origin in manager.generated_views.origins}
+    assert len(trust) == 1 and GreyFiller.calls == 3  # the trial, the anchors, one round
+    assert "hidden view" in capsys.readouterr().out
+    state = manager.get_extra_state()
+    assert state["trust"] == trust.pop()
+    state |= {"finished": False, "views": manager.generated_views.of_round(0).state()}
+    resumed = make(tiny_capture, options(context_views=4, trust="measured"))
+    resumed.set_extra_state(state)
+    run_callbacks(resumed, attributes(resumed), 0)
+    assert GreyFiller.calls == 4, "no second trial"
+    assert {origin.trust for origin in resumed.generated_views.origins} == {state["trust"]}
+
+
 def draws(manager: FillerbusterDataManager, steps: range) -> list[int | str]:
     """Which view each step draws: the captured index, or "g" and the generated picture's sum."""
     result = []

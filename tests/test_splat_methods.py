@@ -46,8 +46,11 @@ def test_the_baseline_differs_in_completion_only() -> None:
 
 COMPLETION = "pipeline.datamanager.completion."
 VARIANTS = {
-    "fillerbuster-cat3d-size": ("fillerbuster", {"context_views": 3, "anchor_views": 0, "densify_rounds": 20, "densify_views": 6}),
-    "fillerbuster-masked": ("fillerbuster", {"task": "inpaint", "at_step": 0, "seed_gaussians": False}),
+    "fillerbuster-cat3d-size": (
+        "fillerbuster",
+        {"context_views": 3, "anchor_views": 0, "densify_rounds": 20, "densify_views": 6, "trust": "full"},
+    ),
+    "fillerbuster-masked": ("fillerbuster", {"task": "inpaint", "at_step": 0, "seed_gaussians": False, "trust": "full"}),
     "nerfiller-grid": ("fillerbuster-masked", {"inpainter": "grid"}),
 }
 
@@ -81,6 +84,7 @@ def test_the_papers_optimisation_differs_in_what_the_paper_says() -> None:
             "at_step": 0,
             "context_choice": "stride",
             "anchor_views": 24,
+            "trust": "full",
             "densify_rounds": 4,
             "generated_share": 0.5,
             "generated_pixels": "all",
