@@ -17,6 +17,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import WHOLLY
 from fb_nerfstudio.bridge import batch_image, batch_known, to_pinhole_list
 from fb_nerfstudio.completion import CapturedView
+from fb_nerfstudio.pictures import CapturePictures
 from fb_nerfstudio.unseen import coarse_mask
 
 
@@ -47,7 +48,7 @@ def _known_as_alpha(dataset: InputDataset) -> Iterator[None]:
         del dataset.get_data
 
 
-class CapturedViewsDatamanager(FullImageDatamanager[InputDataset]):
+class CapturedViewsDatamanager(FullImageDatamanager[CapturePictures]):
     """Captured views as in nerfstudio, whose sequence of draws is decided by how many there have been."""
 
     captured_draws = 0

@@ -1,19 +1,25 @@
-"""nerfstudio's own dataparser without two of its obstacles, and with an eye for frames that no camera took.
+"""Captures with a transforms.json for nerfstudio, read by this project's reader: whatever the check lets pass is trained, and as it is
+meant.
 
-It reads the capture's point cloud without open3d, which needs a system library (libusb), takes cameras that all stand in one place,
-and keeps frames that are marked as generated out of every split: their place is the bank of generated views.
+Same outputs as nerfstudio's own dataparser where that reads a capture rightly (tests compare them), without its obstacles: open3d, which
+needs a system library; questions on a terminal that may not be there; poses in single precision before they are centred; keys that must
+be written its way. Frames that no camera took are kept out of every split: their place is the bank of generated views.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras import camera_utils
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import (
     get_train_eval_split_all,
     get_train_eval_split_filename,
@@ -22,16 +28,36 @@ from nerfstudio.data.utils.dataparsers_utils import (
 )
 from torch import Tensor
 
+from fb_core.data import media
 from fb_core.data.captures import Capture, Frame, read_capture
+from fb_core.data.points import read_points
+from fb_core.data.transforms_json import DISTORTION_KEYS
+from fb_core.data.undistort import FISHEYE_MODELS
 from fb_nerfstudio.bridge import flip_axes
 
-_ONE_PLACE = 1e-6  # of the largest coordinate: what float32 cannot tell apart
+_ONE_PLACE = 1e-6  # of the largest coordinate, in single precision: what it cannot tell apart
+_FAR_OFF = 1000.0  # spreads from the origin: beyond, single precision rounds poses by more than a ten thousandth of the spread
+_STRAIGHT_FISHEYE = 1e-12  # nerfstudio takes a fisheye lens without any coefficient for a pinhole
+_OLD_COLMAP_AXES = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]  # of captures before applied_transform was written
+_logger = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _World:
+    """From the capture's world to that of the training."""
+
+    transform: Tensor
+    """[3, 4], float64: turn and shift."""
+    scale: float
+    """Factor after that."""
+    poses: Tensor
+    """[n, 3, 4] cameras there, float32, OpenGL axes."""
 
 
 class NerfstudioWithoutOpen3d(Nerfstudio):
-    """Same outputs as its parent for photos, also where all cameras stand in one place (one photo, a pure rotation).
+    """Same outputs as its parent for what that reads rightly; the world is the parent's, that of all frames.
 
-    The world is the parent's: that of all frames. Where the capture lists no splits, the parent's choice is made among the photos.
+    Where the capture lists no splits, the parent's choice is made among the photos.
     """
 
     def generated_frames(self) -> list[Frame]:
@@ -39,57 +65,157 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         capture = read_capture(self.config.data)
         if not any(frame.generated for frame in capture.frames):
             return []
-        outputs = self._outputs_of_all(capture, "train", load_3D_points=False)
-        poses = flip_axes(outputs.cameras.camera_to_worlds.double())
+        frames, world = self._world_of(capture)
+        poses = flip_axes(world.poses.double())
+        chosen = range(len(frames))
+        if "train_filenames" in capture.extra:
+            listed = _listed(capture, "train")
+            chosen = [place for place in chosen if _name(frames[place].image_path) in listed]
         return [
-            dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, camera_to_world=poses[index : index + 1]))
-            for index, frame in enumerate(self._frames_of(outputs, capture))
-            if frame.generated
+            dataclasses.replace(frames[place], camera=dataclasses.replace(frames[place].camera, camera_to_world=poses[place : place + 1]))
+            for place in chosen
+            if frames[place].generated
         ]
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         capture = read_capture(self.config.data)
+        frames, world = self._world_of(capture)
+        self._file(frames[0].image_path, capture.root, "images_")  # decides the factor of smaller copies, also for a split without frames
+        photos = [place for place, frame in enumerate(frames) if not frame.generated and not frame.is_bad]
+        chosen = self._chosen(capture, frames, photos, split)
+        files = [self._file(frames[place].image_path, capture.root, "images_") for place in chosen]
+        masks = [frames[place].mask_path for place in chosen]
+        scale, applied = world.scale, capture.extra.get("applied_transform")
+        transform = world.transform
+        if applied is None and (capture.root / "colmap" / "sparse" / "0").exists():
+            applied = _OLD_COLMAP_AXES
+        if applied is not None:
+            applied = torch.tensor(applied, dtype=torch.float64)[:3]
+            transform = transform @ torch.cat([applied, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
+        reach = self.config.scene_scale
+        points = {} if not self.config.load_3D_points else self._points(capture, world)
+        return DataparserOutputs(
+            image_filenames=files,
+            cameras=self._cameras([frames[place] for place in chosen], world.poses[chosen], capture),
+            scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
+            mask_filenames=[self._file(mask, capture.root, "masks_") for mask in masks if mask is not None] or None,
+            dataparser_scale=scale * float(capture.extra.get("applied_scale", 1.0)),
+            dataparser_transform=transform if self._is_far(capture) else transform.float(),
+            metadata={
+                "depth_filenames": self._depths(frames, chosen, capture.root),
+                "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
+                "mask_color": self.config.mask_color,
+                **points,
+            },
+        )
+
+    def _world_of(self, capture: Capture) -> tuple[list[Frame], _World]:
+        """All frames in the parent's order, that of their names, and the world that they are trained in."""
+        frames = sorted(capture.frames, key=lambda frame: frame.image_path)
+        poses = flip_axes(torch.cat([frame.camera.camera_to_world for frame in frames]))  # float64, OpenGL
+        shift = poses[:, :, 3].mean(dim=0) if self._is_far(capture) else torch.zeros(3, dtype=torch.float64)
+        near = torch.cat([poses[:, :, :3], poses[:, :, 3:] - shift[:, None]], dim=2).float()
+        corner = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(len(near), 1, 4)
+        oriented, turn = camera_utils.auto_orient_and_center_poses(
+            torch.cat([near, corner], dim=1),
+            method=capture.extra.get("orientation_override", self.config.orientation_method),
+            center_method=self.config.center_method,
+        )
+        scale = float(self.config.scale_factor)
+        centers = near[:, :, 3]
+        spread = float((centers - centers.mean(dim=0)).abs().max())
+        if self.config.auto_scale_poses and spread > _ONE_PLACE * (1.0 + float(centers.abs().max())):
+            scale /= float(oriented[:, :3, 3].abs().max())  # of cameras in one place there is nothing to divide by
+        oriented = oriented[:, :3].clone()
+        oriented[:, :, 3] *= scale
+        transform = turn.double()
+        transform[:, 3] -= transform[:, :3] @ shift
+        return frames, _World(transform=transform, scale=scale, poses=oriented)
+
+    @staticmethod
+    def _is_far(capture: Capture) -> bool:
+        """Whether the capture lies so far off the origin that single precision would move its cameras (geo-referenced ones do)."""
         centers = capture.poses[:, :, 3]
         spread = float((centers - centers.mean(dim=0)).abs().max())
-        if spread <= _ONE_PLACE * (1.0 + float(centers.abs().max())):
-            self.config.auto_scale_poses = False  # the parent would divide by the spread
-        if not any(frame.generated for frame in capture.frames):
-            return super()._generate_dataparser_outputs(split)
-        outputs = self._outputs_of_all(capture, split)
-        photos = [index for index, frame in enumerate(self._frames_of(outputs, capture)) if not frame.generated]
+        return float(centers.abs().max()) > max(_FAR_OFF * spread, 1.0 / _ONE_PLACE)
+
+    def _chosen(self, capture: Capture, frames: list[Frame], photos: list[int], split: str) -> list[int]:
+        """Places of the frames of a split."""
         if not capture.has_split_lists:
-            photos = [photos[place] for place in _split([outputs.image_filenames[index] for index in photos], split, self.config)]
-        return _only(outputs, photos)
+            return [photos[place] for place in _split([frames[place].image_path for place in photos], split, self.config)]
+        listed = {name: _listed(capture, name) for name in ("train", "val", "test") if f"{name}_filenames" in capture.extra}
+        names = {_name(frame.image_path) for frame in frames}
+        for name, files in listed.items():
+            if foreign := sorted(files - names):
+                _logger.warning("capture %s: %s_filenames names %s, which no frame is; left out", capture.root, name, foreign[0])
+        if split in listed:
+            wanted = listed[split]
+        elif split == "train":  # what is not held out
+            wanted = names.difference(*listed.values())
+        else:
+            other = {"val": "test", "test": "val"}[split]
+            wanted = listed[other] if other in listed else names - listed["train"]
+        return [place for place in photos if _name(frames[place].image_path) in wanted]
 
-    def _outputs_of_all(self, capture: Capture, split: str, **options: Any) -> DataparserOutputs:
-        """The parent's outputs for photos and generated frames: of the split that the capture lists, or of all frames."""
-        given, listed = self.config, capture.has_split_lists
-        everything = {} if listed else {"eval_mode": "fraction", "train_split_fraction": 1.0}
-        self.config = dataclasses.replace(given, **everything, **options)
-        try:
-            return super()._generate_dataparser_outputs(split if listed else "train")
-        finally:
-            self.config = given
+    def _cameras(self, frames: list[Frame], poses: Tensor, capture: Capture) -> Cameras:
+        lenses = [{key: frame.distortion.get(key, 0.0) for key in DISTORTION_KEYS} for frame in frames]
+        for frame, lens in zip(frames, lenses, strict=True):
+            if frame.camera_model in FISHEYE_MODELS and not any(lens.values()):
+                lens["k1"] = _STRAIGHT_FISHEYE
+        types = [CAMERA_MODEL_TO_TYPE[frame.camera_model] for frame in frames]
+        radius = capture.extra.get("fisheye_crop_radius")
+        bent = any(frame.camera_model in FISHEYE_MODELS for frame in capture.frames)
+        numbers = torch.tensor([[*frame.camera.focal[0].tolist(), *frame.camera.principal[0].tolist()] for frame in frames])
+        sizes = torch.tensor([[frame.camera.height, frame.camera.width] for frame in frames], dtype=torch.int32)
+        one_type = types[0] if len(set(types)) == 1 else None if types else CameraType.PERSPECTIVE
+        numbers = numbers.reshape(len(frames), 4)
+        cameras = Cameras(
+            fx=numbers[:, 0], fy=numbers[:, 1], cx=numbers[:, 2], cy=numbers[:, 3],
+            distortion_params=torch.stack([camera_utils.get_distortion_params(**lens) for lens in lenses])
+            if lenses
+            else torch.zeros(0, 6),
+            height=sizes.reshape(-1, 2)[:, 0],
+            width=sizes.reshape(-1, 2)[:, 1],
+            camera_to_worlds=poses,
+            camera_type=one_type if one_type is not None else torch.tensor([[one.value] for one in types]),
+            metadata={"fisheye_crop_radius": radius} if bent and radius is not None else {},
+        )  # fmt: skip
+        assert self.downscale_factor is not None  # `_file` has decided it
+        cameras.rescale_output_resolution(scaling_factor=1.0 / self.downscale_factor)
+        return cameras
 
-    def _frames_of(self, outputs: DataparserOutputs, capture: Capture) -> list[Frame]:
-        """The capture's frames in the order of the outputs."""
+    def _file(self, path: Path, root: Path, prefix: str) -> Path:
+        """The picture, or its smaller copy: of the factor asked for, or without one the first that nerfstudio finds small enough."""
+        if self.downscale_factor is None:
+            self.downscale_factor = self.config.downscale_factor or self._automatic_factor(path, root, prefix)
+        if self.downscale_factor <= 1:
+            return path
+        copy = root / f"{prefix}{self.downscale_factor}" / path.name
+        return path if prefix == "masks_" and not copy.exists() else copy  # a mask of full size is made small with its picture
 
-        def name(path: Path) -> Path:  # of the file that the parent reads, which may be a smaller copy
-            return self._get_fname(path.relative_to(capture.root) if path.is_relative_to(capture.root) else path, capture.root)
+    @staticmethod
+    def _automatic_factor(path: Path, root: Path, prefix: str) -> int:
+        longest, halvings = max(media.image_size(path)), 0
+        while longest / 2**halvings > MAX_AUTO_RESOLUTION and (root / f"{prefix}{2 ** (halvings + 1)}" / path.name).exists():
+            halvings += 1
+        return 2**halvings
 
-        by_name = {name(frame.image_path): frame for frame in capture.frames}
-        return [by_name[path] for path in outputs.image_filenames]
-
-    def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Tensor] | None:
-        """Positions in the training world (float32 [n, 3]) and colours (uint8 [n, 3]; empty without any); None for no points."""
-        import trimesh
-
-        cloud: Any = trimesh.load(str(ply_file_path), process=False)
-        if len(cloud.vertices) == 0:
+    def _depths(self, frames: list[Frame], chosen: list[int], root: Path) -> list[Path] | None:
+        """Depth pictures, where all frames have one."""
+        named = [frame.extra.get("depth_file_path") for frame in frames]
+        if not all(isinstance(name, str) for name in named):
             return None
-        points = torch.from_numpy(np.array(cloud.vertices, dtype=np.float32))
-        points = (points @ transform_matrix[:, :3].T + transform_matrix[:, 3]) * scale_factor
-        return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(_colors_of(cloud))}
+        return [self._file(root / str(named[place]), root, "depths_") for place in chosen] or None
+
+    def _points(self, capture: Capture, world: _World) -> dict[str, Tensor]:
+        """Positions in the training world (float32 [n, 3]) and colours (uint8 [n, 3]); nothing without points."""
+        if capture.points_path is None:
+            return {}
+        points = read_points(capture.points_path)
+        if len(points) == 0:
+            return {}
+        moved = (points.positions @ world.transform[:, :3].T + world.transform[:, 3]) * world.scale
+        return {"points3D_xyz": moved.float(), "points3D_rgb": (points.colors * 255).round().to(torch.uint8)}
 
 
 def without_open3d(config: DataParserConfig) -> DataParserConfig:
@@ -97,6 +223,15 @@ def without_open3d(config: DataParserConfig) -> DataParserConfig:
     if config._target is Nerfstudio:
         config._target = NerfstudioWithoutOpen3d
     return config
+
+
+def _name(path: Path) -> str:
+    return os.path.normpath(path)
+
+
+def _listed(capture: Capture, split: str) -> set[str]:
+    """The files that the capture lists for a split."""
+    return {_name(capture.root / name) for name in capture.extra[f"{split}_filenames"]}
 
 
 def _split(names: list[Path], split: str, config: NerfstudioDataParserConfig) -> list[int]:
@@ -107,29 +242,4 @@ def _split(names: list[Path], split: str, config: NerfstudioDataParserConfig) ->
         train, held_out = get_train_eval_split_interval(names, config.eval_interval)
     else:
         train, held_out = (get_train_eval_split_filename if config.eval_mode == "filename" else get_train_eval_split_all)(names)
-    return [int(place) for place in (train if split == "train" else held_out)]
-
-
-def _only(outputs: DataparserOutputs, chosen: list[int]) -> DataparserOutputs:
-    """The outputs without all other frames."""
-
-    def of(names: list[Path] | None) -> list[Path] | None:
-        return None if names is None else [names[index] for index in chosen]
-
-    return dataclasses.replace(
-        outputs,
-        image_filenames=[outputs.image_filenames[index] for index in chosen],
-        mask_filenames=of(outputs.mask_filenames),
-        cameras=outputs.cameras[torch.tensor(chosen, dtype=torch.long)],
-        metadata={**outputs.metadata, "depth_filenames": of(outputs.metadata["depth_filenames"])},
-    )
-
-
-def _colors_of(cloud: Any) -> np.ndarray:
-    """8-bit colours of a point cloud or of a mesh's corners; [0, 3] where the file has none."""
-    colors = getattr(cloud, "colors", None)
-    if colors is None and getattr(getattr(cloud, "visual", None), "kind", None) == "vertex":
-        colors = cloud.visual.vertex_colors
-    if colors is None or len(colors) != len(cloud.vertices):
-        return np.zeros((0, 3), dtype=np.uint8)
-    return np.ascontiguousarray(colors[:, :3], dtype=np.uint8)
+    return [int(place) for place in np.asarray(train if split == "train" else held_out)]

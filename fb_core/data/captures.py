@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media
-from fb_core.data.points import Points, write_points
+from fb_core.data.points import Points, require_points, write_points
 from fb_core.data.transforms_json import (
     DISTORTION_KEYS,
     INTRINSIC_KEYS,
@@ -31,13 +31,15 @@ from fb_core.data.transforms_json import (
     load_transforms,
     to_json,
 )
-from fb_core.data.undistort import check_lens, undistort
+from fb_core.data.undistort import FISHEYE_MODELS, PERSPECTIVE_MODELS, check_lens, check_straight, undistort
 from fb_core.files.ownership import Target
 from fb_core.files.whole import settled, whole_file, whole_folder
 from fb_core.geometry.cameras import Pinholes
 
 FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
 CAPTURE_KEYS = ("frames", "ply_file_path", *INTRINSIC_KEYS)
+_ORIENTATIONS = ("pca", "up", "vertical", "none")  # nerfstudio's
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".exr")
 _SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")  # lists of file_path
 
 
@@ -63,6 +65,11 @@ class Frame:
         """Whether the frame says that no camera took it."""
         return bool(self.extra.get("generated", False))
 
+    @property
+    def is_bad(self) -> bool:
+        """Whether the frame is marked as one not to be used (``is_bad`` of ScanNet++)."""
+        return bool(self.extra.get("is_bad", False))
+
     def load_image(self) -> Float[Tensor, "3 h w"]:
         """RGB in [0, 1] of the camera's size, bent as the lens bent it. Raises ValueError for a bad file or another size."""
         return self._load()[0]
@@ -87,10 +94,10 @@ class Frame:
             raise ValueError(_wrong_size(self, "image", self.image_path, stored))
         mask = torch.ones_like(image[:1]) if alpha is None else (alpha >= 0.5).to(image)
         if self.mask_path is not None:
-            painted = media.read_image(self.mask_path, apply_orientation=upright)[:1]
+            painted = media.read_mask(self.mask_path, apply_orientation=upright)
             if tuple(painted.shape[1:]) != size:
                 raise ValueError(_wrong_size(self, "mask", self.mask_path, tuple(painted.shape[1:])))
-            mask = mask * (painted >= 0.5)
+            mask = mask * painted
         return image.clamp(0, 1), mask
 
 
@@ -112,8 +119,8 @@ class Capture:
 
     @property
     def photos(self) -> Capture:
-        """The capture without its generated frames."""
-        return dataclasses.replace(self, frames=tuple(frame for frame in self.frames if not frame.generated))
+        """The capture without its generated frames and those marked as bad."""
+        return dataclasses.replace(self, frames=tuple(frame for frame in self.frames if not frame.generated and not frame.is_bad))
 
     @property
     def has_split_lists(self) -> bool:
@@ -205,8 +212,16 @@ def validate_capture(folder: str | Path, *, decode: bool = False) -> Capture:
         raise ValueError(f"capture {folder}: expected mask_path in all frames or in none, got {masked} of {len(capture)}; add white masks")
     if capture.points_path is not None and not capture.points_path.is_file():
         raise ValueError(f"capture {folder}: ply_file_path names {capture.points_path}, which is missing; restore it or remove the key")
+    orientation = capture.extra.get("orientation_override", "none")
+    if orientation not in _ORIENTATIONS:
+        raise ValueError(
+            f"capture {folder}: expected orientation_override as one of {', '.join(_ORIENTATIONS)}, got {orientation!r}; correct the file"
+        )
+    if capture.points_path is not None:
+        require_points(capture.points_path)
     for frame in capture.frames:
         check_lens(frame.camera_model, frame.distortion, f"image {frame.image_path}")
+        check_straight(frame.camera, frame.camera_model, frame.distortion, f"image {frame.image_path}")
         for kind, path in (("image", frame.image_path), ("mask", frame.mask_path)):
             if path is None:
                 continue
@@ -298,8 +313,8 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError(f"{where}: expected an object with a 'file_path', got {str(entry)[:80]}; process the pictures again")
     where += f" ({entry['file_path']})"
-    image_path = json_path.parent / entry["file_path"]
-    lens = shared if any(key in shared for key in DISTORTION_KEYS) else entry
+    image_path = _with_suffix(json_path.parent / entry["file_path"])
+    lens = _lens(where, shared if any(key in shared for key in (*DISTORTION_KEYS, "distortion_params")) else entry)
     mask = entry.get("mask_path")
     if not (mask is None or isinstance(mask, str)):
         raise ValueError(f"{where}: expected a file name for mask_path, got {mask!r}; correct the file")
@@ -308,9 +323,34 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
         mask_path=None if mask is None else json_path.parent / mask,
         camera=camera_from(where, image_path, entry, shared),
         distortion={key: finite_number(where, lens, key) for key in DISTORTION_KEYS if key in lens},
-        camera_model=str(shared.get("camera_model", entry.get("camera_model", "OPENCV"))),
+        camera_model=_model_of(entry, shared),
         extra={key: value for key, value in entry.items() if key not in FRAME_KEYS},
     )
+
+
+def _with_suffix(path: Path) -> Path:
+    """The file itself, or, for a name without a suffix as Blender's tools write it, the picture of that name."""
+    if path.suffix or path.exists():
+        return path
+    return next((named for suffix in _SUFFIXES if (named := path.with_name(path.name + suffix)).exists()), path)
+
+
+def _lens(where: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The same keys with nerfstudio's list of coefficients, if there is one, spread over k1, k2, k3, k4, p1, p2."""
+    listed = values.get("distortion_params")
+    if listed is None or values.get("camera_model", "OPENCV") not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS):
+        return values  # models that are not supported have lists of their own
+    if not isinstance(listed, list) or len(listed) != len(DISTORTION_KEYS):
+        raise ValueError(
+            f"{where}: expected distortion_params as six numbers k1, k2, k3, k4, p1, p2, got {str(listed)[:60]}; correct the file"
+        )
+    return {**values, **dict(zip(DISTORTION_KEYS, listed, strict=True))}
+
+
+def _model_of(entry: dict[str, Any], shared: dict[str, Any]) -> str:
+    """The lens model's name; instant-ngp's ``is_fisheye`` says it, too."""
+    fisheye = shared.get("is_fisheye", entry.get("is_fisheye", False)) is True
+    return str(shared.get("camera_model", entry.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV")))
 
 
 def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, ...]) -> str:

@@ -22,6 +22,7 @@ from fb_core.files.whole import by_way_of_memory
 from fb_core.limits import require_decodable
 
 HEIF_SUFFIXES = (".heic", ".heif")
+_ONE_OF_255 = 1 / 255 + 1e-6
 _MARKER_IN_JPEG_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # stuffed zeros, fill bytes and restarts are no markers
 
 
@@ -58,6 +59,13 @@ def read_image_with_alpha(
     if not luminance:
         raise ValueError(f"image {path}: expected channels R, G, B or one grey channel, got {names}; read it with read_exr")
     return repeat(pixels[luminance[0]], "h w -> channels h w", channels=3), alpha
+
+
+def read_mask(path: str | Path, *, apply_orientation: bool = True) -> Float[Tensor, "1 h w"]:
+    """1 where a mask's picture is lighter than half, else 0; of a picture of 0 and 1 alone (of 255), where it is 1."""
+    values = read_image(path, apply_orientation=apply_orientation)[:1]
+    top = float(values.max())
+    return (values > 0 if 0 < top <= _ONE_OF_255 else values >= 0.5).to(values)
 
 
 def has_alpha(path: str | Path) -> bool:

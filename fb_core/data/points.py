@@ -34,7 +34,8 @@ class Points:
 
 
 def read_points(path: str | Path) -> Points:
-    """Points of a PLY file (or the corners of its mesh); grey where it has no colours. Raises ValueError for what is no such file."""
+    """Finite points of a PLY file (or the corners of its mesh), grey where it has no colours. Raises ValueError for other files."""
+    require_points(path)
     import trimesh
 
     try:
@@ -42,12 +43,22 @@ def read_points(path: str | Path) -> Points:
         positions = torch.from_numpy(np.array(cloud.vertices, dtype=np.float64))
     except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
         raise ValueError(f"points {path}: not readable as a PLY file ({error}); restore it") from error
+    finite = torch.isfinite(positions).all(dim=1)
     colors = getattr(cloud, "colors", None)
     if colors is None and getattr(getattr(cloud, "visual", None), "kind", None) == "vertex":
         colors = cloud.visual.vertex_colors
     if colors is None or len(colors) != len(positions):
-        return Points(positions=positions, colors=torch.full_like(positions, 0.5))
-    return Points(positions=positions, colors=torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255)
+        return Points(positions=positions[finite], colors=torch.full_like(positions[finite], 0.5))
+    return Points(positions=positions[finite], colors=(torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255)[finite])
+
+
+def require_points(path: str | Path) -> None:
+    """Raises ValueError for a file that does not begin as a PLY file does, such as the pointer that Git LFS leaves in its place."""
+    with Path(path).open("rb") as file:
+        start = file.read(64)
+    if not start.startswith(b"ply"):
+        lfs = ", but the pointer of a file that Git LFS keeps: git lfs pull" if start.startswith(b"version https://git-lfs") else ""
+        raise ValueError(f"points {path}: expected a PLY file, which this is not{lfs}; restore it, or remove ply_file_path")
 
 
 def write_points(path: str | Path, points: Points) -> None:

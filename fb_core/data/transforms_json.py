@@ -21,8 +21,12 @@ from fb_core.limits import is_finite
 
 JSON_NAME = "transforms.json"
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *DISTORTION_KEYS, "camera_model")
+INTRINSIC_KEYS = (
+    *("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y"),
+    *(*DISTORTION_KEYS, "camera_model", "is_fisheye"),
+)
 _BLANK = 64  # bytes of a file that may be nothing but white space
+_LAST_ROW_TOLERANCE = 1e-5  # what tools that compute in single precision leave of 0 0 0 1
 _ROTATION_TOLERANCE = 1e-3  # an error of that size moves a pixel by one at a focal of 1000
 
 
@@ -97,7 +101,12 @@ def to_json(meta: dict[str, Any], where: str) -> str:
 def _focal(where: str, values: dict[str, Any], name: str, angle_name: str, length: float) -> float | None:
     if name in values:
         return finite_number(where, values, name)
-    return 0.5 * length / math.tan(finite_number(where, values, angle_name) / 2) if angle_name in values else None
+    if angle_name not in values:
+        return None
+    angle = finite_number(where, values, angle_name)
+    if not 0 < angle < math.pi:
+        raise ValueError(f"{where}: expected {angle_name} between 0 and pi radians, got {angle:g}; correct the file")
+    return 0.5 * length / math.tan(angle / 2)
 
 
 def finite_number(where: str, values: dict[str, Any], key: str) -> float:
@@ -118,7 +127,7 @@ def checked_pose(where: str, matrix: Any) -> Float[Tensor, "3 4"]:
         raise ValueError(f"{where}: expected transform_matrix as 4 x 4 (or 3 x 4) numbers, got {str(matrix)[:60]}; correct the file")
     if not bool(torch.isfinite(pose).all()):
         raise ValueError(f"{where}: the pose (transform_matrix) holds NaN or infinity, expected finite numbers; remove the frame")
-    if len(pose) == 4 and pose[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+    if len(pose) == 4 and float((pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()) > _LAST_ROW_TOLERANCE:
         raise ValueError(f"{where}: expected 0 0 0 1 as the pose's (transform_matrix) last row, got {pose[3].tolist()}; correct the file")
     rotation = pose[:3, :3]
     error = float((rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from fb_core.masks import wholly_known
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+_WIDEST = 3.0  # tangent of the angle off the axis up to which a perspective lens is looked at (72 degrees)
 _TOUCHES_NOTHING = 1 - 1e-4  # OpenCV knows 32 places within a pixel: a neighbour weighs at least 1 / 1024
 
 
@@ -26,6 +28,11 @@ def check_lens(camera_model: str, distortion: dict[str, float], where: str) -> N
     if camera_model in PERSPECTIVE_MODELS and distortion.get("k4", 0.0) != 0.0:
         k4 = distortion["k4"]
         raise ValueError(f"{where}: {camera_model} with k4 = {k4:g}, expected only k1, k2, k3, p1, p2; undistort the images first")
+
+
+def is_straight(camera_model: str, distortion: dict[str, float]) -> bool:
+    """Whether the lens is a pinhole. A fisheye lens never is: without coefficients it is equidistant."""
+    return camera_model not in FISHEYE_MODELS and not any(distortion.values())
 
 
 def undistort(
@@ -45,7 +52,7 @@ def undistort(
         the lens's picture, and every pixel that touches an unknown one, is unknown.
     """
     check_lens(camera_model, distortion, "undistort")
-    if not any(distortion.values()):
+    if is_straight(camera_model, distortion):
         return image, mask, camera
     import cv2
 
@@ -63,7 +70,7 @@ def undistort(
 def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, float]) -> Pinholes:
     """The camera that :func:`undistort` gives, without a picture."""
     check_lens(camera_model, distortion, "straight_camera")
-    if not any(distortion.values()):
+    if is_straight(camera_model, distortion):
         return camera
     import cv2
 
@@ -76,6 +83,23 @@ def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, f
     values = torch.from_numpy(np.asarray(matrix, dtype=np.float64))
     focal, principal = torch.stack([values[0, 0], values[1, 1]])[None], values[None, :2, 2] + 0.5
     return dataclasses.replace(camera, focal=focal.to(camera.focal), principal=principal.to(camera.principal))
+
+
+def check_straight(camera: Pinholes, camera_model: str, distortion: dict[str, float], where: str) -> None:
+    """Raises ValueError for a lens that no pinhole camera can replace: a calibration that failed. ``where`` opens the sentence.
+
+    A lens that exists bends outer rays further outwards than inner ones, over half of the picture at the very least.
+    """
+    fisheye = camera_model in FISHEYE_MODELS
+    reach = torch.linspace(0, math.pi / 2 if fisheye else _WIDEST, 2000, dtype=torch.float64)  # angles, or tangents of angles
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3")
+    bent = reach * (1 + sum(distortion.get(name, 0.0) * reach ** (2 * power) for power, name in enumerate(names, start=1)))
+    falls = (bent.diff() <= 0).nonzero()
+    farthest = float(bent[int(falls[0])]) if len(falls) else math.inf
+    half = min(camera.width / float(camera.focal[0, 0]), camera.height / float(camera.focal[0, 1])) / 2
+    if not farthest >= half / 2:
+        told = ", ".join(f"{name} = {value:g}" for name, value in distortion.items() if value)
+        raise ValueError(f"{where}: a lens with {told} shows less than half of the picture and cannot be undistorted; calibrate it again")
 
 
 def _matrix(camera: Pinholes) -> np.ndarray:

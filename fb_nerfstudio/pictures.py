@@ -1,0 +1,58 @@
+"""The capture's pictures and masks as nerfstudio's dataset, read by this project's one reader (`fb_core.data.media`).
+
+nerfstudio reads with Pillow and takes stored numbers for colours: palette entries for grey, 16-bit values modulo 256, black for alpha in
+printers' colours, and every mask value but 0 for known. Here a picture is the same wherever it is looked at.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+
+from fb_core.data import media
+
+
+class CapturePictures(InputDataset):
+    """Pictures of 8 bits (RGB, or RGBA where the file has alpha) and masks of a capture, scaled as nerfstudio scales them."""
+
+    def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        """[h, w, 3 or 4] of the camera's size. Raises ValueError in one sentence for a file that cannot be read."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+        pixels, alpha = media.read_image_with_alpha(path, apply_orientation=self._lies_on_its_side(image_idx))
+        channels = pixels if alpha is None else torch.cat([pixels, alpha])
+        picture = Image.fromarray((channels.clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).numpy())
+        if self.scale_factor != 1.0:
+            size = (int(picture.width * self.scale_factor), int(picture.height * self.scale_factor))
+            picture = picture.resize(size, resample=Image.Resampling.BILINEAR)
+        return np.array(picture, dtype=np.uint8)
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """As in nerfstudio; ``mask`` is True where the mask is lighter than half, at the picture's size.
+
+        Called by several threads at once.
+        """
+        image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
+        data: dict[str, Any] = {"image_idx": image_idx, "image": image}
+        masks = self._dataparser_outputs.mask_filenames
+        if masks is not None:
+            known = media.read_mask(masks[image_idx], apply_orientation=self._lies_on_its_side(image_idx))[0]
+            picture = Image.fromarray((known.numpy() * 255).astype(np.uint8))
+            if picture.size != (image.shape[1], image.shape[0]):
+                picture = picture.resize((image.shape[1], image.shape[0]), resample=Image.Resampling.NEAREST)
+            data["mask"] = torch.from_numpy(np.array(picture))[..., None] > 0
+            if self.mask_color:
+                shade = torch.tensor(self.mask_color) * (255 if image.dtype == torch.uint8 else 1)
+                data["image"] = torch.where(data["mask"], image, shade.to(image.dtype))
+        return data | self.get_metadata(data)
+
+    def _lies_on_its_side(self, image_idx: int) -> bool:
+        """Whether the camera counts the pixels of the upright picture: posed pictures are counted as stored, unless only that fits."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+        camera = self._dataparser_outputs.cameras[image_idx]
+        size = (int(camera.height), int(camera.width))
+        return media.image_size(path, apply_orientation=False) != size and media.image_size(path) == size
