@@ -228,9 +228,10 @@ def test_an_unknown_orientation_is_one_sentence(tiny_capture: Path) -> None:
 
 
 def test_a_lens_that_no_pinhole_camera_can_replace_is_one_sentence(tiny_capture: Path) -> None:
-    edited(tiny_capture, lambda meta: meta.update(k1=-44.85))
-    with pytest.raises(ValueError, match="cannot be undistorted"):
-        validate_capture(tiny_capture)
+    for lens in ({"k1": -44.85}, {"k1": -44.85, "k2": 1017.4, "p1": 0.62, "p2": 0.94}):
+        edited(tiny_capture, lambda meta, lens=lens: meta.update(lens))
+        with pytest.raises(ValueError, match="cannot be undistorted"):
+            validate_capture(tiny_capture)
 
 
 # ---- pictures and masks ----------------------------------------------------------------------------------------------

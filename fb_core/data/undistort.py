@@ -16,6 +16,7 @@ from fb_core.masks import wholly_known
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+_FOCAL_RATIOS = (0.05, 20.0)  # of straight cameras over bent ones, for lenses that exist
 _WIDEST = 3.0  # tangent of the angle off the axis up to which a perspective lens is looked at (72 degrees)
 _TOUCHES_NOTHING = 1 - 1e-4  # OpenCV knows 32 places within a pixel: a neighbour weighs at least 1 / 1024
 
@@ -97,9 +98,10 @@ def check_straight(camera: Pinholes, camera_model: str, distortion: dict[str, fl
     falls = (bent.diff() <= 0).nonzero()
     farthest = float(bent[int(falls[0])]) if len(falls) else math.inf
     half = min(camera.width / float(camera.focal[0, 0]), camera.height / float(camera.focal[0, 1])) / 2
-    if not farthest >= half / 2:
+    ratio = straight_camera(camera, camera_model, distortion).focal / camera.focal
+    if not (farthest >= half / 2 and bool(((ratio > _FOCAL_RATIOS[0]) & (ratio < _FOCAL_RATIOS[1])).all())):
         told = ", ".join(f"{name} = {value:g}" for name, value in distortion.items() if value)
-        raise ValueError(f"{where}: a lens with {told} shows less than half of the picture and cannot be undistorted; calibrate it again")
+        raise ValueError(f"{where}: a lens with {told} bends the picture beyond recognition and cannot be undistorted; calibrate it again")
 
 
 def _matrix(camera: Pinholes) -> np.ndarray:
