@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.evaluation.correspondences import Correspondences, Matcher
+from fb_core.evaluation.correspondences import Correspondences, Matcher, enlargement
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.feature_pairs import FEWEST_MATCHES, angles_degrees, motion, rays_of
+from fb_core.geometry.two_view_rotation import two_view_rotation
 
 THRESHOLDS = (1, 2, 5, 10, 20)
 """Degrees below which a pair counts as right; the paper names none, so that all of these are told."""
@@ -25,9 +25,6 @@ FAILED = 180.0
 """Degrees that a pair counts which could not be estimated."""
 _AREA_TO = 10  # degrees; mean accuracy over the whole thresholds 1 to 10 (as in the image matching challenges)
 _TOLERANCE = 1.0  # pixels of a picture of 384 or more pixels; half of it in a smaller one, which is doubled
-_DRAWS = 200  # of two matches, for a rotation alone
-_WORTH_MOVING = 1.2  # the essential matrix must explain so many times the matches that a rotation alone explains
-_BOTH_BEFORE = "the essential matrix", "a rotation alone"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,49 +72,13 @@ def relative_rotation(
         first, second: one camera each, of which only focal length and principal point are used.
         tolerance: pixels by which a match may be off.
     """
-    if len(found) < FEWEST_MATCHES:
-        return None, 0
     places = [_normalised(found.first, first), _normalised(found.second, second)]
-    angle = tolerance / min(float(camera.focal.mean()) for camera in (first, second))
-    turn, turned = _rotation_alone(rays_of(places[0]), rays_of(places[1]), angle)
-    moved_turn, _, kept = motion(places[0], places[1], angle)
-    moved = int(kept.sum())
-    # On a turn on the spot any direction of movement fits and drags the rotation along: movement must explain clearly more.
-    if moved >= FEWEST_MATCHES and moved > _WORTH_MOVING * turned:
-        return moved_turn, moved
-    return (turn, turned) if turned >= FEWEST_MATCHES else (None, 0)
+    turn = two_view_rotation(*places, tolerance=tolerance / min(float(camera.focal.mean()) for camera in (first, second)))
+    return (None, 0) if turn is None else (turn.rotation, turn.inliers)
 
 
 def _normalised(places: Float[Tensor, "m 2"], camera: Pinholes) -> Float[np.ndarray, "m 2"]:
     return ((places.double() - camera.principal[0].double()) / camera.focal[0].double()).cpu().numpy()
-
-
-def _rotation_alone(first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"], angle: float) -> tuple[np.ndarray, int]:
-    """The rotation that takes most unit vectors to their partners within an angle (radians): two at a time, then all that agree."""
-    random = np.random.default_rng(0)
-    draws = random.integers(len(first), size=(_DRAWS, 2))
-    limit = math.cos(min(angle, math.pi / 2))
-    turns = _best_rotations(first[draws], second[draws])
-    agree = np.einsum("rij,mj,mi->rm", turns, first, second) >= limit
-    best = int(agree.sum(axis=1).argmax())
-    turn, kept = turns[best], agree[best]
-    for _ in range(3):
-        if kept.sum() < 2:
-            break
-        better = _best_rotations(first[kept][None], second[kept][None])[0]
-        now = np.einsum("ij,mj,mi->m", better, first, second) >= limit
-        if now.sum() < kept.sum():
-            break
-        turn, kept = better, now
-    return turn, int(kept.sum())
-
-
-def _best_rotations(first: Float[np.ndarray, "r k 3"], second: Float[np.ndarray, "r k 3"]) -> Float[np.ndarray, "r 3 3"]:
-    """Least-squares rotations of k vectors each (Kabsch 1976)."""
-    left, _, right = np.linalg.svd(np.einsum("rki,rkj->rij", second, first))
-    sign = np.ones((len(first), 3))
-    sign[:, 2] = np.linalg.det(left @ right)
-    return (left * sign[:, None, :]) @ right
 
 
 def true_rotation(first: Pinholes, second: Pinholes) -> Float[np.ndarray, "3 3"]:
@@ -153,7 +114,7 @@ def judge_pairs(
     for number, (first, second) in enumerate(pairs):
         images = pictures(first), pictures(second)
         found, truth = matcher(*images), true_rotation(cameras[first], cameras[second])
-        tolerance = _TOLERANCE if max(images[0].shape[1:]) >= 384 else _TOLERANCE / 2
+        tolerance = _TOLERANCE / enlargement(images[0])
         estimated, inliers = relative_rotation(found, cameras[first], cameras[second], tolerance=tolerance)
         error = FAILED if estimated is None else rotation_angle_degrees(estimated, truth)
         true_degrees = rotation_angle_degrees(truth, np.eye(3))

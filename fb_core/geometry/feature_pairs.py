@@ -133,7 +133,7 @@ def verified_pair(
     first = photos[i].offsets[matches[:, 0]] / focal[i]
     second = photos[j].offsets[matches[:, 1]] / focal[j]
     tolerance = max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j])
-    rotation, translation, inliers = motion(first, second, tolerance)
+    rotation, translation, inliers = _motion(first, second, tolerance)
     if inliers.sum() < FEWEST_MATCHES:
         return None
     angle = angles_degrees(rays_of(first[inliers]) @ rotation.T, rays_of(second[inliers]))
@@ -160,7 +160,7 @@ def _on_epipolar_lines(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray
     return np.zeros(len(first), bool)
 
 
-def motion(
+def _motion(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], tolerance: float
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 1"], Bool[np.ndarray, " m"]]:
     """Rotation, direction of translation, and the matches that they put on their epipolar lines and before both cameras.
