@@ -119,9 +119,7 @@ def judge_pairs(
         error = FAILED if estimated is None else rotation_angle_degrees(estimated, truth)
         true_degrees = rotation_angle_degrees(truth, np.eye(3))
         results.append(
-            PairResult(
-                first=first, second=second, true_degrees=true_degrees, error_degrees=error, matches=len(found), inliers=inliers
-            )
+            PairResult(first=first, second=second, true_degrees=true_degrees, error_degrees=error, matches=len(found), inliers=inliers)
         )
         on_pair(number + 1, len(pairs))
     return results
