@@ -26,6 +26,7 @@ from method_configs.consistency_evaluation import Consistency
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
 from method_configs.methods_benchmark import Methods
+from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
@@ -297,6 +298,7 @@ def evaluate(
         | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
         | Annotated[Ablations, tyro.conf.subcommand("ablations")]
         | Annotated[Consistency, tyro.conf.subcommand("consistency")]
+        | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

@@ -19,6 +19,7 @@ FEWEST = 10
 """Fewer matches that agree say nothing."""
 _DRAWS = 200  # of two matches, for a rotation alone
 _CLEARLY = 3.0  # squared misses of a rotation alone over those of a movement; 2 is expected where there is none
+_REFINED = 6  # candidates, the best ones
 _CAP = 3.0  # tolerances from which a match counts as an outlier
 
 
@@ -46,12 +47,10 @@ def two_view_rotation(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray,
     rays = rays_of(first), rays_of(second)
     turn, misses = _rotation_alone(*rays, tolerance)
     turned = int((misses <= tolerance).sum())
-    best = _movement(first, second, rays, turn, tolerance)
-    if best is not None:
-        rotation, kept, lines = best
-        still = np.minimum(misses[kept], _CAP * tolerance)
-        if kept.sum() >= FEWEST and (kept.sum() > turned or turned < FEWEST) and (still**2).sum() > _CLEARLY * (lines[kept] ** 2).sum():
-            return Turn(rotation=rotation, inliers=int(kept.sum()), moved=True)
+    rotation, kept, lines = _movement(first, second, rays, turn, tolerance)
+    still = np.minimum(misses[kept], _CAP * tolerance)
+    if kept.sum() >= FEWEST and (still**2).sum() > _CLEARLY * (lines[kept] ** 2).sum():
+        return Turn(rotation=rotation, inliers=int(kept.sum()), moved=True)
     return Turn(rotation=turn, inliers=turned, moved=False) if turned >= FEWEST else None
 
 
@@ -61,36 +60,45 @@ def _movement(
     rays: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
     turn: Float[np.ndarray, "3 3"],
     tolerance: float,
-) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, " m"], Float[np.ndarray, " m"]] | None:
-    """Rotation, the matches that agree, and every match's distance from its epipolar line; None where no candidate is found."""
-    best, most = None, -1.0
-    for start in [*_candidates(first, second, tolerance), *((turn, way) for way in np.eye(3))]:
-        rotation, way = _refined(first, second, *start, tolerance)
+) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Rotation, the matches that agree, and every match's distance from its epipolar line."""
+
+    def judged(rotation: np.ndarray, way: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         lines = _line_distances(first, second, rotation, way)
         near = lines <= tolerance
         kept = near & max((_before(rays, rotation, sign * way, tolerance) for sign in (1, -1)), key=lambda before: (near & before).sum())
-        score = kept.sum() - np.minimum(lines / tolerance, 1).mean()  # the closer one of two that as many agree with
-        if score > most:
-            best, most = (rotation, kept, lines), score
-    return best
+        return kept.sum() - np.minimum(lines / tolerance, 1).mean(), kept, lines  # the closer one of two that as many agree with
+
+    def best_first(starts: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+        return sorted(starts, key=lambda start: -judged(*start)[0])
+
+    starts = [*best_first(_candidates(first, second, tolerance))[:_REFINED], *best_first([(turn, way) for way in np.eye(3)])[:1]]
+    refined = [_refined(first, second, *start, tolerance) for start in starts]
+    results = [(rotation, *judged(rotation, way)) for rotation, way in refined]
+    rotation, _, kept, lines = max(results, key=lambda result: result[1])
+    return rotation, kept, lines
 
 
 def _candidates(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], tolerance: float
 ) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-    """Rotations and directions of movement of OpenCV's essential matrices."""
+    """Rotations and directions of movement of OpenCV's essential matrices and, as walls are planes, of its homography."""
     import cv2
 
-    found = []
-    for method in (cv2.USAC_MAGSAC, cv2.LMEDS):
+    found, identity = [], np.eye(3)
+    for method in (cv2.USAC_MAGSAC, cv2.RANSAC, cv2.LMEDS):
         try:
-            essential, _ = cv2.findEssentialMat(first, second, np.eye(3), method, 0.9999, tolerance)
+            essential, _ = cv2.findEssentialMat(first, second, identity, method, 0.9999, tolerance)
         except cv2.error:  # an assertion of OpenCV's own on some matches of good pictures
             continue
-        if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
-            continue
-        one, other, way = cv2.decomposeEssentialMat(essential)
-        found += [(one, way[:, 0]), (other, way[:, 0])]
+        for rows in () if essential is None else np.split(essential, range(3, len(essential), 3)):  # one below the other
+            if rows.shape == (3, 3) and np.isfinite(rows).all():
+                one, other, way = cv2.decomposeEssentialMat(rows)
+                found += [(one, way[:, 0]), (other, way[:, 0])]
+    plane, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2 * tolerance, maxIters=5000, confidence=0.9999)
+    if plane is not None and np.isfinite(plane).all():
+        _, turns, ways, _ = cv2.decomposeHomographyMat(plane, identity)
+        found += [(turn, way[:, 0] / length) for turn, way in zip(turns, ways, strict=True) if (length := np.linalg.norm(way)) > 0]
     return found
 
 
