@@ -25,6 +25,7 @@ from method_configs.bench_splat import Splat
 from method_configs.consistency_evaluation import Consistency
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
+from method_configs.inference_benchmark import Inference
 from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
@@ -284,6 +285,7 @@ def bench(
         | Annotated[Splat, tyro.conf.subcommand("splat")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[Methods, tyro.conf.subcommand("methods")]
+        | Annotated[Inference, tyro.conf.subcommand("inference")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from method_configs.table_files import TableFiles
+from method_configs.table_files import TableFiles, chosen_device
 
 if TYPE_CHECKING:
     from fb_core.evaluation.ablations import Asked
@@ -44,6 +44,8 @@ class ModelOnCaptures(TableFiles):
     """Denoising steps; by default each model's recommendation."""
     lpips: Path | None = None
     """torchvision's weights of SqueezeNet 1.1; without them LPIPS is left out."""
+    device: str | None = None
+    """Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one."""
     family: Literal["narrow", "medium", "wide"] = "narrow"
     """Which rooms, where there is no data."""
 
@@ -62,7 +64,7 @@ class ModelOnCaptures(TableFiles):
             )
         distance, models = _distance(self.lpips), {}
         for folder in self.models or (None,):
-            model = Fillerbuster.from_pretrained(folder)
+            model = Fillerbuster.from_pretrained(folder, device=chosen_device(self.device))
             models["bundled" if folder is None else folder.name] = model
         if len(models) < len(self.models):
             raise ValueError("models: two folders have the same name; rename one, as the table tells models by their folders' names")
@@ -81,13 +83,13 @@ class ModelOnCaptures(TableFiles):
         """(views, number) -> the sequence that all models are asked."""
         import torch
 
-        from fb_core.data.capture_questions import drawn_views, readable_captures
-        from fb_core.data.capture_sequences import CaptureConfig, find_captures
+        from fb_core.data.capture_questions import capture_folders, drawn_views, readable_captures
+        from fb_core.data.capture_sequences import CaptureConfig
         from fb_core.evaluation.ablations import Asked
         from fb_core.evaluation.completion import unseen_room
         from fb_core.masks import training_mixture
 
-        folders = None if self.data is None else find_captures(self.data)
+        folders = None if self.data is None else capture_folders(self.data)
         captures = {} if folders is None else {length: readable_captures(folders, views=length) for length in self.lengths}
 
         @cache

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.data.capture_sequences import CaptureConfig, TrainingCapture, Window, read_training_capture, strided
+from fb_core.data.capture_sequences import CaptureConfig, TrainingCapture, Window, find_captures, read_training_capture, strided
 from fb_core.geometry.cameras import Pinholes
 
 _logger = logging.getLogger(__name__)
@@ -33,6 +33,38 @@ class CaptureViews:
     def __getitem__(self, part: slice) -> CaptureViews:
         places = list(range(*part.indices(len(self.images))))
         return CaptureViews(images=self.images[part], cameras=self.cameras[places], truth=self.truth[part], capture=self.capture)
+
+
+_PICTURES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".webp"}
+_FILMS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
+
+
+def capture_folders(data: Path) -> list[Path]:
+    """Every folder with a transforms.json at or below ``data``. Raises ValueError that says what it looks like otherwise."""
+    if not data.is_dir():
+        raise ValueError(f"data: expected a folder of captures, got {data}, which is none; check the path")
+    try:
+        return find_captures(data)
+    except ValueError:
+        kind, remedy = looks_like(data)
+        raise ValueError(f"data: expected captures with a transforms.json at or below {data}, got {kind}; {remedy}") from None
+
+
+def looks_like(folder: Path) -> tuple[str, str]:
+    """What a folder without transforms.json seems to be, and what turns it into a capture."""
+    files = [path for path in sorted(folder.rglob("*"))[:10_000] if path.is_file()]
+    names, suffixes = {path.name for path in files}, {path.suffix.lower() for path in files}
+    if names & {"cameras.bin", "cameras.txt"}:
+        return "a COLMAP model", "run ns-process-data images --skip-colmap on it"
+    if any(name.startswith("transforms_") and name.endswith(".json") for name in names):
+        return "a Blender scene with one transforms file for each split", "name the one to use transforms.json"
+    if any(path.suffix == ".tar" for path in files):
+        return "WebDataset shards, which have no cameras", "give captures"
+    if suffixes & _FILMS:
+        return "a film", "run fillerbuster complete --poses-only or ns-process-data video on it"
+    if suffixes & _PICTURES:
+        return "photos without cameras", "run fillerbuster complete --poses-only or ns-process-data images on it"
+    return "an empty folder" if not files else "files of no kind that is known here", "check the path"
 
 
 def readable_captures(folders: Sequence[Path], *, views: int) -> list[tuple[str, TrainingCapture]]:

@@ -1,0 +1,113 @@
+"""`fillerbuster eval model`: the questions drawn from captures, what is not true does not count, one table of several models."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tiny_models import save_tiny_model, tiny_model
+
+from fb_core.data.capture_questions import CaptureViews, capture_folders, drawn_views, readable_captures
+from fb_core.data.capture_sequences import CaptureConfig
+from fb_core.evaluation import ablations
+from fb_core.evaluation.ablations import Asked, conditional_validation_loss, sequence_scores
+from fb_core.inpainter import SamplingConfig
+from method_configs.model_evaluation import PAPER, ModelOnCaptures
+
+
+def views_of(capture: Path, *, views: int = 4, seed: int = 0) -> CaptureViews:
+    captures = readable_captures([capture], views=views)
+    return drawn_views(captures, views, CaptureConfig(image_size=32), generator=torch.Generator().manual_seed(seed))
+
+
+def test_questions_are_decided_by_their_seed(tiny_capture: Path):
+    one, same, other = (views_of(tiny_capture, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one.images, same.images) and torch.equal(one.cameras.camera_to_world, same.cameras.camera_to_world)
+    assert not torch.equal(one.images, other.images)
+    assert one.images.shape == (4, 3, 32, 32) and one.capture == "tiny_capture"
+    assert 0 < float(one.truth.mean()) < 1, "every second picture has a mask"
+    assert float((one.images * (1 - one.truth)).abs().max()) == 0
+
+
+def test_what_is_not_true_does_not_count(tiny_capture: Path, tmp_path: Path, monkeypatch):
+    """An error of 0.1 in true pixels is 20 dB, whatever stands where nobody knows the truth."""
+    views = views_of(tiny_capture)
+    known = torch.zeros_like(views.truth)
+    known[0] = views.truth[0]
+    wrong = torch.where(views.truth > 0, views.images + 0.1, 0.7 * torch.ones_like(views.images))
+    monkeypatch.setattr(ablations, "conditional_validation_loss", lambda *_, **__: 1.0)
+    model = SimpleNamespace(complete=lambda *_, **__: SimpleNamespace(images=wrong))
+    scores = sequence_scores(model, Asked(views, known, 0), SamplingConfig(steps=1), 2, None)  # type: ignore[arg-type]
+    assert scores["psnr"] == pytest.approx(20.0, abs=1e-3)
+
+
+def test_validation_loss_of_a_capture(tiny_capture: Path, tmp_path: Path):
+    views = views_of(tiny_capture)
+    loss = conditional_validation_loss(tiny_model(tmp_path), views, torch.ones_like(views.truth), times=2)
+    assert 0 < loss < 100
+
+
+def test_several_models_in_one_table_and_nothing_twice(tiny_capture: Path, tmp_path: Path, monkeypatch):
+    models = tuple(save_tiny_model(tmp_path / name, seed=seed) for seed, name in enumerate(("first", "second")))
+    suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
+    files = {name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()}
+    shutil.copytree(tiny_capture, tmp_path / "captures" / "a" / "b")
+    options = {"data": tmp_path / "captures", "models": models, "lengths": (4,), "sequences": 2, "times": 2, "steps": 1}
+    command = ModelOnCaptures(**options, keep=tmp_path / "kept", **files)
+    command.run()
+    rows = json.loads(files["json"].read_text())["rows"]
+    ours = [row for row in rows if "model" in row]
+    assert [row["method"] for row in ours] == ["first", "second"] and all(row["views"] == 4 for row in ours)
+    assert ours[0]["model"] != ours[1]["model"] and {"psnr", "psnr_interval", "ssim", "val"} <= set(ours[0])
+    assert all(path.stat().st_size > 100 for path in files.values())
+
+    def never(*_):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(ablations, "sequence_scores", never)
+    command.run()
+    with pytest.raises(AssertionError):
+        ModelOnCaptures(**options | {"seed": 1}, keep=tmp_path / "kept").run()
+
+
+def test_rooms_where_there_is_no_data(tmp_path: Path):
+    folder = save_tiny_model(tmp_path / "model")
+    command = ModelOnCaptures(models=(folder,), lengths=(8,), sequences=1, times=1, steps=1, json=tmp_path / "table.json")
+    command.run()
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    assert rows[0]["views"] == 8 and "narrow rooms" in rows[0]["part"]
+    said = {row["method"]: row["psnr"] for row in rows[1:]}
+    assert said == {name: cells[8][0] for name, cells in PAPER.items()}, "beside it, what the paper has"
+
+
+def test_bad_data_is_told(tiny_capture: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"has 6 frames, fewer than the 8 views of a sequence\); ask for fewer views"):
+        ModelOnCaptures(data=tiny_capture, lengths=(8,)).run()
+    with pytest.raises(ValueError, match="lengths of 4 or more views"):
+        ModelOnCaptures(lengths=(3,)).run()
+    with pytest.raises(ValueError, match="which is none; check the path"):
+        capture_folders(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("sparse/0/cameras.bin", "a COLMAP model; run ns-process-data"),
+        ("transforms_train.json", "a Blender scene"),
+        ("a/film.MP4", "a film; run fillerbuster complete"),
+        ("images/1.JPG", "photos without cameras"),
+        ("00000.tar", "WebDataset shards"),
+        ("notes.txt", "files of no kind"),
+        (None, "an empty folder"),
+    ],
+)
+def test_folders_of_another_kind_are_named(file: str | None, said: str, tmp_path: Path):
+    if file is not None:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    with pytest.raises(ValueError, match=said):
+        capture_folders(tmp_path)
