@@ -20,7 +20,8 @@ _ALWAYS_SHOWN = (
     *("block_psnr", "seconds", "peak_gib"),
     *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
     *("rotation_degrees", "center", "focal_percent", "found_share", "trusted_share", "rra_15", "rta_15", "rooms"),
-    *("capture", "rra_2", "rra_5", "rra_10", "median_degrees", "failed", "still_5", "model", "psnr", "ssim", "lpips", "val", "device", "how", "paper_a100_seconds"),
+    *("capture", "rra_2", "rra_5", "rra_10", "median_degrees", "failed", "still_5"),
+    *("model", "normals", "psnr", "ssim", "lpips", "val", "device", "how", "paper_a100_seconds"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )
 

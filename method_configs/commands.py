@@ -26,6 +26,7 @@ from method_configs.consistency_evaluation import Consistency
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
 from method_configs.inference_benchmark import Inference
+from method_configs.masked_evaluation import Masked, Paper
 from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
@@ -286,6 +287,7 @@ def bench(
         | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[Methods, tyro.conf.subcommand("methods")]
         | Annotated[Inference, tyro.conf.subcommand("inference")]
+        | Annotated[Paper, tyro.conf.subcommand("paper")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
@@ -301,6 +303,7 @@ def evaluate(
         | Annotated[Ablations, tyro.conf.subcommand("ablations")]
         | Annotated[Consistency, tyro.conf.subcommand("consistency")]
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
+        | Annotated[Masked, tyro.conf.subcommand("masked")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

@@ -15,7 +15,7 @@ from fb_core.data.capture_questions import CaptureViews, capture_folders, drawn_
 from fb_core.data.capture_sequences import CaptureConfig
 from fb_core.evaluation import ablations
 from fb_core.evaluation.ablations import Asked, conditional_validation_loss, sequence_scores
-from fb_core.inpainter import SamplingConfig
+from fb_core.inpainter import Fillerbuster, SamplingConfig
 from method_configs.model_evaluation import PAPER, ModelOnCaptures
 
 
@@ -40,8 +40,8 @@ def test_what_is_not_true_does_not_count(tiny_capture: Path, tmp_path: Path, mon
     known[0] = views.truth[0]
     wrong = torch.where(views.truth > 0, views.images + 0.1, 0.7 * torch.ones_like(views.images))
     monkeypatch.setattr(ablations, "conditional_validation_loss", lambda *_, **__: 1.0)
-    model = SimpleNamespace(complete=lambda *_, **__: SimpleNamespace(images=wrong))
-    scores = sequence_scores(model, Asked(views, known, 0), SamplingConfig(steps=1), 2, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(Fillerbuster, "complete", lambda *_, **__: SimpleNamespace(images=wrong))
+    scores = sequence_scores(tiny_model(tmp_path), Asked(views, known, 0), SamplingConfig(steps=1), 2, None)
     assert scores["psnr"] == pytest.approx(20.0, abs=1e-3)
 
 

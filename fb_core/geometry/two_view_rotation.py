@@ -20,6 +20,7 @@ FEWEST = 10
 _DRAWS = 200  # of two matches, for a rotation alone
 _CLEARLY = 3.0  # squared misses of a rotation alone over those of a movement; 2 is expected where there is none
 _REFINED = 6  # candidates, the best ones
+_ENOUGH = 150  # matches to refine a movement on
 _CAP = 3.0  # tolerances from which a match counts as an outlier
 
 
@@ -110,6 +111,8 @@ def _refined(
     import cv2
     from scipy.optimize import least_squares
 
+    some = slice(None, None, max(1, len(first) // _ENOUGH))
+    first, second = first[some], second[some]
     aside = np.linalg.svd(way[None])[2][1:]  # two unit vectors across the direction
 
     def at(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
