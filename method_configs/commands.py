@@ -22,6 +22,7 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.conditioning_evaluation import Conditioning
 from method_configs.consistency_evaluation import Consistency
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
@@ -301,6 +302,7 @@ def evaluate(
         | Annotated[Scaling, tyro.conf.subcommand("scaling")]
         | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
         | Annotated[Ablations, tyro.conf.subcommand("ablations")]
+        | Annotated[Conditioning, tyro.conf.subcommand("conditioning")]
         | Annotated[Consistency, tyro.conf.subcommand("consistency")]
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
         | Annotated[Masked, tyro.conf.subcommand("masked")]

@@ -13,9 +13,10 @@ from tiny_models import save_tiny_model, tiny_model
 
 from fb_core.data.capture_questions import CaptureViews, capture_folders, drawn_views, readable_captures
 from fb_core.data.capture_sequences import CaptureConfig
-from fb_core.evaluation import ablations
+from fb_core.evaluation import ablations, conditioning
 from fb_core.evaluation.ablations import Asked, conditional_validation_loss, sequence_scores
 from fb_core.inpainter import Fillerbuster, SamplingConfig
+from method_configs.conditioning_evaluation import Conditioning
 from method_configs.model_evaluation import PAPER, ModelOnCaptures
 
 
@@ -91,6 +92,38 @@ def test_bad_data_is_told(tiny_capture: Path, tmp_path: Path):
         ModelOnCaptures(lengths=(3,)).run()
     with pytest.raises(ValueError, match="which is none; check the path"):
         capture_folders(tmp_path / "nowhere")
+
+
+def test_the_same_hidden_views_from_more_and_more_known_ones(tiny_capture: Path, tmp_path: Path, monkeypatch):
+    asked, real = [], conditioning.generated_from
+
+    def recorded(model, views, *, hidden, known, sampling, seed):
+        asked.append((known, seed, views.images[:hidden]))
+        return real(model, views, hidden=hidden, known=known, sampling=sampling, seed=seed)
+
+    monkeypatch.setattr(conditioning, "generated_from", recorded)
+    suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png", "sheet": "sheet.png"}
+    files = {name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()}
+    folder = save_tiny_model(tmp_path / "model")
+    options = {"data": tiny_capture, "model": folder, "known": (1, 4), "hidden": 2, "sequences": 2, "steps": 1, "keep": tmp_path / "kept"}
+    Conditioning(**options, **files).run()
+    assert [(known, seed) for known, seed, _ in asked[:4]] == [(1, 0), (1, 1), (4, 0), (4, 1)]
+    assert torch.equal(asked[0][2], asked[2][2]) and torch.equal(asked[1][2], asked[3][2])
+    rows = json.loads(files["json"].read_text())["rows"]
+    assert [row["known"] for row in rows] == [1, 4] and all(path.stat().st_size > 100 for path in files.values())
+    Conditioning(**options).run()
+    assert len(asked) == 6, "four scores and two rows of the sheet"
+    with pytest.raises(ValueError, match="fewer than the 8 views"):
+        Conditioning(**options | {"known": (6,)}).run()
+    with pytest.raises(ValueError, match="got known none, hidden 2, sequences 2"):
+        Conditioning(**options | {"known": ()}).run()
+
+
+def test_scores_of_hidden_views(tiny_capture: Path):
+    views = views_of(tiny_capture)
+    garbage = torch.where(views.truth > 0, views.images + 0.1, 0.3 * torch.ones_like(views.images))
+    assert conditioning.scores_of(garbage, views)["psnr"] == pytest.approx(20.0, abs=1e-3)
+    assert conditioning.scores_of(views.images, views)["ssim"] == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
