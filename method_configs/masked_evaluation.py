@@ -64,6 +64,8 @@ class Paper(TableFiles):
     """Step from which normals are regularised, instead of the methods' own."""
     model: Path | None = None
     """Model folder; by default the bundled one."""
+    inpainter_weights: Path | None = None
+    """diffusers folder of the 2D inpainter of nerfiller-grid; by default OpenCV's, without weights."""
     completion: dict[str, str] = dataclasses.field(default_factory=dict)
     """Further options of every method's completion, as names and values."""
     lpips: Path | None = None
@@ -92,6 +94,8 @@ class Paper(TableFiles):
             options["pipeline.model.normal-loss-from"] = self.normals_from
         if self.model is not None:
             options["pipeline.datamanager.completion.model"] = self.model.absolute()
+        if self.inpainter_weights is not None and method == "nerfiller-grid":
+            options["pipeline.datamanager.completion.inpainter-weights"] = self.inpainter_weights.absolute()
         if not normals:
             options |= {"pipeline.model.normal-alignment-weight": 0.0, "pipeline.model.normal-tv-weight": 0.0}
         options |= {f"pipeline.datamanager.completion.{name}": value for name, value in self.completion.items()}

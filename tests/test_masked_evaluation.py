@@ -78,10 +78,13 @@ def test_runs_differ_in_the_normals_weights_alone(method: str, tmp_path: Path):
     """And ns-train knows all of the options."""
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-    command = Paper(data=tmp_path, output=tmp_path / "out", iterations=40, normals_from=7, completion={"steps": "3"}, seed=5)
+    command = Paper(
+        data=tmp_path, output=tmp_path / "out", iterations=40, normals_from=7, completion={"steps": "3"}, seed=5, inpainter_weights=tmp_path
+    )
     both = [tyro.cli(AnnotatedBaseConfigUnion, args=command.arguments(method, normals)) for normals in (True, False)]
     weights = [(one.pipeline.model.normal_alignment_weight, one.pipeline.model.normal_tv_weight) for one in both]
     assert min(weights[0]) > 0 and weights[1] == (0.0, 0.0)
+    assert both[0].pipeline.datamanager.completion.inpainter_weights == (tmp_path if method == "nerfiller-grid" else None)
     assert both[0].experiment_name != both[1].experiment_name and both[0].pipeline.datamanager.completion.steps == 3
     both[1].experiment_name, both[1].pipeline.model = both[0].experiment_name, both[0].pipeline.model
     assert both[0] == both[1] and both[0].machine.seed == 5 and both[0].max_num_iterations == 40

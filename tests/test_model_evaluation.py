@@ -34,6 +34,28 @@ def test_questions_are_decided_by_their_seed(tiny_capture: Path):
     assert float((one.images * (1 - one.truth)).abs().max()) == 0
 
 
+@pytest.mark.parametrize("layout", ["nerfstudio", "lerf", "scannetpp"])
+def test_datasets_as_they_lie_on_disk(layout: str, tiny_capture: Path, tmp_path: Path):
+    """A folder of scenes; LERF's lie deeper; ScanNet++ has its pictures and masks in folders beside that of transforms.json."""
+    root = tmp_path / "dataset"
+    place = {"nerfstudio": "scene", "lerf": "LERF_Dataset/scene", "scannetpp": "data/scene/dslr/nerfstudio"}[layout]
+    shutil.copytree(tiny_capture, root / place)
+    if layout == "scannetpp":
+        content = json.loads((root / place / "transforms.json").read_text())
+        for kind, key, folder in (("images", "file_path", "resized_images"), ("masks", "mask_path", "resized_anon_masks")):
+            names = {Path(frame[key]).name for frame in content["frames"] if key in frame}
+            assert names
+            (root / place / kind).rename((root / place).parent / folder)
+            for frame in content["frames"]:
+                if key in frame:
+                    frame[key] = Path(frame[key]).name
+        (root / place / "transforms.json").write_text(json.dumps(content))
+    folders = capture_folders(root)
+    assert [folder.relative_to(root).as_posix() for folder in folders] == [place]
+    views = drawn_views(readable_captures(folders, views=4), 4, CaptureConfig(image_size=32), generator=torch.Generator().manual_seed(1))
+    assert torch.equal(views.images, views_of(tiny_capture, seed=1).images) and 0 < float(views.truth.mean()) < 1
+
+
 def test_what_is_not_true_does_not_count(tiny_capture: Path, tmp_path: Path, monkeypatch):
     """An error of 0.1 in true pixels is 20 dB, whatever stands where nobody knows the truth."""
     views = views_of(tiny_capture)
