@@ -20,6 +20,8 @@ _ALWAYS_SHOWN = (
     *("block_psnr", "seconds", "peak_gib"),
     *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
     *("rotation_degrees", "center", "focal_percent", "found_share", "trusted_share", "rra_15", "rta_15", "rooms"),
+    *("capture", "rra_2", "rra_5", "rra_10", "median_degrees", "failed", "still_5"),
+    *("model", "normals", "psnr", "ssim", "lpips", "val", "device", "how", "paper_a100_seconds"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )
 
@@ -109,7 +111,7 @@ def show(report: Report, json: Path | None, drawings: list) -> None:
     for bar in report.bars:
         console.print(f"{'holds ' if bar.holds else 'MISSED'}  {bar.name}: {_told(bar.value)} (bar {bar.sense} {bar.limit:g})")
     if json is not None:
-        _logger.info("wrote %s", report.write(json, command=_command()))
+        _logger.info("wrote %s", report.write(json, command=command_line()))
     for draw in drawings:
         draw()
 
@@ -122,7 +124,7 @@ def _told(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _command() -> str:
+def command_line() -> str:
     """What was typed, without the folder of the program."""
     return " ".join(["fillerbuster", *sys.argv[1:]])
 

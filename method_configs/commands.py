@@ -22,9 +22,14 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.conditioning_evaluation import Conditioning
+from method_configs.consistency_evaluation import Consistency
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
+from method_configs.inference_benchmark import Inference
+from method_configs.masked_evaluation import Masked, Paper
 from method_configs.methods_benchmark import Methods
+from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
@@ -282,6 +287,8 @@ def bench(
         | Annotated[Splat, tyro.conf.subcommand("splat")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[Methods, tyro.conf.subcommand("methods")]
+        | Annotated[Inference, tyro.conf.subcommand("inference")]
+        | Annotated[Paper, tyro.conf.subcommand("paper")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
@@ -295,6 +302,10 @@ def evaluate(
         | Annotated[Scaling, tyro.conf.subcommand("scaling")]
         | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
         | Annotated[Ablations, tyro.conf.subcommand("ablations")]
+        | Annotated[Conditioning, tyro.conf.subcommand("conditioning")]
+        | Annotated[Consistency, tyro.conf.subcommand("consistency")]
+        | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
+        | Annotated[Masked, tyro.conf.subcommand("masked")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

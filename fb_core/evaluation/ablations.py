@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import encode_in_chunks, encode_known, join, stacked_facts, unsplit
+from fb_core.data.capture_questions import CaptureViews
 from fb_core.data.rooms import require_family
 from fb_core.evaluation.completion import RoomViews, unseen_room
 from fb_core.evaluation.image_metrics import psnr, ssim
@@ -51,7 +52,7 @@ class AblationTask:
 class Asked(NamedTuple):
     """One sequence, and what of it is told."""
 
-    room: RoomViews
+    room: RoomViews | CaptureViews
     known: Float[Tensor, "n 1 h w"]
     seed: int
     """Decides the sample."""
@@ -88,7 +89,7 @@ def evaluate_design(
     for length, sequences in asked.items():
         scores = []
         for sequence in sequences:
-            scores.append(_scores(model, sequence, sampling, times, distance))
+            scores.append(sequence_scores(model, sequence, sampling, times, distance))
             done += 1
             on_sequence(done, total)
         means = {name: sum(score[name] for score in scores) / len(scores) for name in scores[0]}
@@ -96,13 +97,20 @@ def evaluate_design(
     return rows
 
 
-def _scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: int, distance: Distance | None) -> dict[str, float]:
+def sequence_scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: int, distance: Distance | None) -> dict[str, float]:
+    """PSNR (dB), SSIM, LPIPS with a ``distance``, and VAL of one sequence, as `evaluate_design` averages them."""
     room, known, seed = asked
     views = dataclasses.replace(Views.known(room.images, room.cameras), image_known=known)
     completed = model.complete(views, generator=torch.Generator().manual_seed(seed), sampling=sampling).images
-    incomplete = (known < 1).flatten(1).any(dim=1)
+    incomplete = (known < (room.truth if isinstance(room, CaptureViews) else 1)).flatten(1).any(dim=1)
     pair = completed[incomplete], room.images[incomplete]
-    scores = {"psnr": float(psnr(*pair).mean()), "ssim": float(ssim(*pair).mean())}
+    if isinstance(room, CaptureViews):  # what nobody knows counts as right; PSNR is of the rest
+        truth = room.truth[incomplete]
+        pair = torch.where(truth > 0, pair[0], pair[1]), pair[1]
+        unknown = -10 * truth.mean(dim=(1, 2, 3)).clamp_min(1e-6).log10()
+    else:
+        unknown = torch.zeros(len(pair[0]))
+    scores = {"psnr": float((psnr(*pair) - unknown).mean()), "ssim": float(ssim(*pair).mean())}
     if distance is not None:
         scores["lpips"] = float(distance(*pair).mean())
     return scores | {"val": conditional_validation_loss(model, room, known, times=times, seed=seed)}
@@ -110,7 +118,7 @@ def _scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: 
 
 @torch.no_grad()
 def conditional_validation_loss(
-    model: Fillerbuster, room: RoomViews, known: Float[Tensor, "n 1 h w"], *, times: int = 20, seed: int = 0
+    model: Fillerbuster, room: RoomViews | CaptureViews, known: Float[Tensor, "n 1 h w"], *, times: int = 20, seed: int = 0
 ) -> float:
     """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
     images, known = room.images.to(model.device), known.to(model.device)
