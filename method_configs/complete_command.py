@@ -20,6 +20,7 @@ from fb_core.data.captures import read_capture
 from fb_core.data.own_files import own_points
 from fb_core.data.photo_choice import doubtful, require_two_views
 from fb_core.data.photos import Photo, read_photos
+from fb_core.data.undistort import is_straight
 from fb_core.evaluation.self_consistency import self_consistency
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
@@ -112,7 +113,7 @@ def _target(source: Path, output: Path, options: CompleteOptions, overwrite: boo
 
 def _read(source: Path, options: CompleteOptions) -> Job:
     photos = read_photos(source)
-    world = _world_of(source if source.is_dir() else source.parent) if photos[0].camera is not None else None
+    world = _world_of(source) if photos[0].camera is not None else None
     if options.known_poses is not None:
         photos, world = _with_known_poses(photos, options.known_poses), _world_of(options.known_poses)
     unknown = [photo for photo in photos if photo.camera is None]
@@ -126,24 +127,37 @@ def _read(source: Path, options: CompleteOptions) -> Job:
     return Job(photos=[photo for photo in photos if photo.name not in left_out], left_out=left_out, world=world or upright)
 
 
-def _world_of(folder: Path) -> World:
-    """What a posed capture says beside its cameras."""
-    capture = read_capture(folder)
+def _world_of(source: Path) -> World:
+    """What a posed capture, a folder or its JSON file, says beside its cameras."""
+    capture = read_capture(source)
     return World(
         extra={key: value for key, value in capture.extra.items() if key not in _WORKING},
         points_path=own_points(capture),
-        straight=frozenset(frame.image_path for frame in capture.frames if not any(frame.distortion.values())),
+        straight=frozenset(frame.image_path for frame in capture.frames if is_straight(frame.camera_model, frame.distortion)),
     )
 
 
 def _with_known_poses(photos: list[Photo], capture: Path) -> list[Photo]:
     """The photos; those that the capture has by the same file name come from there, with camera and without lens distortion."""
-    posed = {photo.source.name: photo for photo in read_photos(capture)}
-    if not any(photo.source.name in posed for photo in photos):
+    posed: dict[str, Photo] = {}
+    by_name: dict[str, list[Photo]] = {}
+    for photo in read_photos(capture):
+        by_name.setdefault(photo.source.name, []).append(photo)
+    for photo in photos:
+        namesakes = by_name.get(photo.source.name, [])
+        if len(namesakes) > 1:  # rigs have one file of each name in every camera's folder
+            namesakes = [one for one in namesakes if _same_file(one.source, photo.source)]
+        if len(namesakes) == 1:
+            posed[photo.source.name] = namesakes[0]
+        elif photo.source.name in by_name:
+            _logger.warning(
+                "%s: several pictures of --known-poses have this name, none is this photo; its camera is looked for", photo.name
+            )
+    if not any(photo.source.name in by_name for photo in photos):
         raise ValueError(
             f"--known-poses {capture}: none of its pictures has the file name of a photo, such as {photos[0].source.name}; rename them"
         )
-    lenses = {photo.size: photo for photo in posed.values()}
+    lenses = {photo.size: photo for photo in (*(one for many in by_name.values() for one in many), *posed.values())}
 
     def merged(photo: Photo) -> Photo:
         if photo.source.name in posed:
@@ -154,6 +168,11 @@ def _with_known_poses(photos: list[Photo], capture: Path) -> list[Photo]:
         return dataclasses.replace(photo, focal_prior=lens.focal_prior, device=lens.device)
 
     return [merged(photo) for photo in photos]
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether two files hold the same bytes."""
+    return one.stat().st_size == other.stat().st_size and one.read_bytes() == other.read_bytes()
 
 
 def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | None:

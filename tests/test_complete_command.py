@@ -22,6 +22,7 @@ from tiny_models import save_tiny_model
 
 from fb_core.data import media
 from fb_core.data.captures import FrameToWrite, read_capture, validate_capture, write_capture
+from fb_core.data.photos import read_photos
 from fb_core.data.points import Points, read_points
 from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import write_contact_sheet
@@ -358,3 +359,39 @@ def test_a_machine_without_graphics_keeps_all_the_rest(tmp_path: Path, model: Pa
     monkeypatch.setattr(complete_output, "draw_cameras", fails)
     complete(posed(tmp_path / "capture", cameras_on_an_arc(3, width=20, height=20)), tmp_path / "out", model)
     assert "cameras.png is left out" in caplog.text and (tmp_path / "out" / "sheet.png").exists()
+
+
+def test_a_rig_s_pictures_of_one_name_are_told_apart_by_what_they_hold(tmp_path: Path, caplog) -> None:
+    """cam0/0.png and cam1/0.png are different photos: each photo gets the camera of the picture that it is, or none."""
+    from method_configs.complete_command import _with_known_poses
+
+    truth = cameras_on_an_arc(4)
+    rig = write_capture(tmp_path / "rig", [
+        FrameToWrite(name=f"p{index}", image=torch.full((3, 16, 16), index / 8), camera=truth[index].scaled(16, 16).to(torch.float64))
+        for index in range(4)
+    ])  # fmt: skip
+    meta = json.loads((rig.root / "transforms.json").read_text())
+    (tmp_path / "photos").mkdir()
+    for index, frame in enumerate(meta["frames"]):
+        place = rig.root / "images" / f"cam{index // 2}" / f"{index % 2}.png"
+        place.parent.mkdir(exist_ok=True)
+        (rig.root / frame["file_path"]).rename(place)
+        frame["file_path"] = str(place.relative_to(rig.root))
+        if index // 2 == 0:
+            (tmp_path / "photos" / place.name).write_bytes(place.read_bytes())
+    (rig.root / "transforms.json").write_text(json.dumps(meta))
+    found = _with_known_poses(read_photos(tmp_path / "photos"), rig.root)
+    assert [one.source.parent.name for one in found] == ["cam0", "cam0"] and all(one.camera is not None for one in found)
+    media.write_image(tmp_path / "photos" / "0.png", torch.rand(3, 16, 16))
+    found = _with_known_poses(read_photos(tmp_path / "photos"), rig.root)
+    assert found[0].camera is None and found[1].camera is not None and "none is this photo" in caplog.text
+
+
+def test_a_capture_s_json_file_may_have_any_name(tmp_path: Path, model: Path) -> None:
+    posed = write_capture(tmp_path / "posed", [
+        FrameToWrite(name=f"p{index}", image=torch.rand(3, 16, 16), camera=camera.scaled(16, 16).to(torch.float64))
+        for index, camera in enumerate(cameras_on_an_arc(4))
+    ])  # fmt: skip
+    (posed.root / "transforms.json").rename(posed.root / "transforms_train.json")
+    report = complete(posed.root / "transforms_train.json", tmp_path / "out", model, "--poses-only")
+    assert report["cameras"]["method"] == "known" and len(read_capture(tmp_path / "out")) == 4
