@@ -22,6 +22,7 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.design_evaluation import Designs
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
 from method_configs.methods_benchmark import Methods
@@ -295,6 +296,7 @@ def evaluate(
         | Annotated[Scaling, tyro.conf.subcommand("scaling")]
         | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
         | Annotated[Ablations, tyro.conf.subcommand("ablations")]
+        | Annotated[Designs, tyro.conf.subcommand("designs")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""
