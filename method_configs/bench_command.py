@@ -20,6 +20,7 @@ _ALWAYS_SHOWN = (
     *("block_psnr", "seconds", "peak_gib"),
     *("scene", "peer", "views", "size", "steps", "parameters", "relative_difference"),
     *("rotation_degrees", "center", "focal_percent", "found_share", "trusted_share", "rra_15", "rta_15", "rooms"),
+    *("design", "psnr_sample_gain", "psnr_sample_spread", "val_gain", "val_spread"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )
 

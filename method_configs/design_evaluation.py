@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json as json_format
 import logging
+import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -140,7 +141,7 @@ class Designs:
         if not self.seeds or min(self.seeds) < 0 or self.batches < 1:
             raise ValueError(f"designs: expected at least one seed from 0 on and at least one batch, got {self.seeds} and {self.batches}")
         names = ["base", *(name for name in self.designs if name != "base")]
-        work = _Work(self.output, self.batches, Fillerbuster.from_pretrained(self.model), DesignTask(rooms=self.rooms))
+        work = DesignTrainings(self.output, self.batches, Fillerbuster.from_pretrained(self.model), DesignTask(rooms=self.rooms))
         found: dict[tuple[str, int], dict[str, Any]] = {}
         for seed in self.seeds:
             for name in names:
@@ -152,7 +153,7 @@ class Designs:
         show(report, self.json, [])
 
 
-class _Work:
+class DesignTrainings:
     """Trainings and measurements, kept in a folder."""
 
     def __init__(self, output: Path, batches: int, autoencoders: Fillerbuster, task: DesignTask):
@@ -172,14 +173,26 @@ class _Work:
         path = folder / "measured.json"
         if path.exists() and (kept := json_format.loads(path.read_text()))["asked"] == asked:
             return kept["found"]
+        self._claim(folder, {name: asked[name] for name in ("recipe", "batches", "autoencoders")})
         network, found = self._trained(design, folder)
         found |= self._scores(network, design, guess=design.told_guess)
         if design.told_guess:
             found["without"] = self._scores(network, design, guess=False)
         with whole_file(path) as unfinished:
             unfinished.write_text(json_format.dumps({"asked": asked, "found": found}, indent=1) + "\n")
-        _logger.info("%s: %s", folder.name, ", ".join(f"{name} {found[name]:.3f}" for name in _METRICS if found[name] is not None))
+        _logger.info("%s: %s", folder.name, ", ".join(f"{name} {found[name]:.3f}" for name in _METRICS))
         return found
+
+    def _claim(self, folder: Path, settings: dict[str, Any]) -> None:
+        """A training is gone on with only if all that decides it is as before."""
+        note = folder / "settings.json"
+        before = json_format.loads(note.read_text()) if note.exists() else None
+        if before != settings and (folder / "checkpoint.pt").exists():
+            names = ", ".join(name for name in settings if before is None or before.get(name) != settings[name])
+            raise ValueError(f"{folder} holds a training with another {names}; choose another output folder, or remove this one")
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole_file(note) as unfinished:
+            unfinished.write_text(json_format.dumps(settings, indent=1) + "\n")
 
     def _scores(self, network: DiT, design: Design, *, guess: bool) -> dict[str, float]:
         from fb_core.evaluation.designs import asked_rooms, evaluate
@@ -190,26 +203,29 @@ class _Work:
         return evaluate(network, self._asked[patch], self._task, image_vae=self._vaes["image_vae"], told_guess=guess)
 
     def _trained(self, design: Design, folder: Path) -> tuple[DiT, dict[str, Any]]:
-        """The averaged network, and CPU seconds per step (of the steps that are done now; None for no step) with the losses on the way."""
+        """The averaged network, and CPU seconds per step (of the steps that are done now; nan for none) with the losses on the way."""
+        from fb_core.networks.dit import DiT
         from fb_core.training.loop import Run
 
         recipe = design.recipe
-        batches = self._batches_of(recipe)
+        batches = self.batches_of(recipe)
         batches.make(recipe.dit_loop.steps)
-        run = Run(self._stage(design, batches), recipe.dit_loop, folder, preset=recipe.name, engine=recipe.engine)
-        seconds = _timed(run)
+        run = Run(self.stage_of(design, batches), recipe.dit_loop, folder, preset=recipe.name, engine=recipe.engine)
+        seconds = _timed(run, recipe.seed)
         if run.signal:
             raise SystemExit(128 + run.signal)
+        assert isinstance(run.stage.network, DiT)
         network = type(run.stage.network)(recipe.dit)
         network.load_state_dict(run.averaged_state())
         found = {
             "parameters": sum(parameter.numel() for parameter in network.parameters()),
-            "cpu_seconds_per_step": statistics.median(seconds) if seconds else None,
+            "cpu_seconds_per_step": statistics.median(seconds) if seconds else math.nan,
             "losses": windows([json_format.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]),
         }
         return network, found
 
-    def _stage(self, design: Design, batches: KeptBatches) -> Stage:
+    def stage_of(self, design: Design, batches: KeptBatches) -> Stage:
+        """What a design minimises, with fresh weights."""
         import torch
 
         from fb_core.evaluation.design_stages import DepthTaughtStage, KeptStage, PredictsData, PredictsDataStage
@@ -222,7 +238,7 @@ class _Work:
         stage = kinds[1](network, batches, **self._vaes, pool=batches.stage.pool, config=recipe.dit_loss, seed=recipe.seed)
         return DepthTaughtStage(stage) if design.depth else stage
 
-    def _batches_of(self, recipe: Recipe) -> KeptBatches:
+    def batches_of(self, recipe: Recipe) -> KeptBatches:
         """The batches of its seed, task and batch size; what else there is in a recipe is left behind, so that designs share them."""
         loss = dataclasses.replace(recipe.dit_loss, draws=1, pure_noise=0.0)
         # Frames of tokens that no compared network attends in need not be kept for each size of patch.
@@ -238,7 +254,7 @@ class _Work:
         return KeptBatches(stage, self._output / "batches", count=self._batches, data=data)
 
 
-def _timed(run: Run) -> list[float]:
+def _timed(run: Run, seed: int) -> list[float]:
     """Train to the end; CPU seconds of every step."""
     seconds: list[float] = []
     began = time.process_time()
@@ -249,7 +265,7 @@ def _timed(run: Run) -> list[float]:
         seconds.append(now - began)
         began = now
         if step % 100 == 0:
-            _logger.info("%s, seed %d: step %d of %d", run.preset, run.stage.__dict__.get("seed", 0), step, steps)
+            _logger.info("%s, seed %d: step %d of %d", run.preset, seed, step, steps)
 
     run.train(on_progress=on_progress)
     return seconds
@@ -264,28 +280,29 @@ def windows(log: Sequence[dict[str, float]]) -> list[dict[str, float]]:
 
 
 def table(found: Mapping[tuple[str, int], dict[str, Any]], names: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """A row for each design: means over its trainings, and how far they are from the base's, training by training, with the spread."""
-    rows = []
+    """Means over each design's trainings; and how far they are from the base's, training by training, with the spread (`beside`)."""
+    trainings = {name: [found[name, seed] for seed in seeds] for name in names}
     for name in names:
-        rows.append(_row(name, [found[name, seed] for seed in seeds], [found["base", seed] for seed in seeds]))
-        if "without" in found[name, seeds[0]]:
-            bare = [found[name, seed] | found[name, seed]["without"] for seed in seeds]
-            rows.append(_row(f"{name}, none told", bare, [found["base", seed] for seed in seeds]))
-    return rows
+        if "without" in trainings[name][0]:
+            trainings[f"{name}, none told"] = [one | one["without"] for one in trainings[name]]
+    means, differences = [], []
+    for name, mine in trainings.items():
+        values = {metric: [one[metric] for one in mine] for metric in _METRICS}
+        row = {"part": "designs", "design": name, "parameters": mine[0]["parameters"]}
+        means.append(row | {metric: statistics.fmean(values[metric]) for metric in _METRICS})
+        if name != "base":
+            differences.append(_beside_base(name, values, trainings["base"]))
+    return means + differences
 
 
-def _row(name: str, mine: list[dict[str, Any]], base: list[dict[str, Any]]) -> dict[str, Any]:
+def _beside_base(name: str, values: Mapping[str, list[float]], base: list[dict[str, Any]]) -> dict[str, Any]:
     from fb_core.evaluation.designs import beside
 
-    row: dict[str, Any] = {"part": "designs", "design": name, "trainings": len(mine), "parameters": mine[0]["parameters"]}
-    for metric in _METRICS:
-        values, others = ([one[metric] for one in group] for group in (mine, base))
-        if None in values or None in others:  # a training that was cut off between its last step and its measurement
-            continue
-        row[metric] = statistics.fmean(values)
-        if name != "base":
-            row[f"{metric}_gain"], row[f"{metric}_spread"] = beside(values, others)
-    return row
+    row: dict[str, Any] = {"part": "beside the base", "design": name}
+    for metric in _METRICS[:-1]:
+        row[f"{metric}_gain"], row[f"{metric}_spread"] = beside(values[metric], [one[metric] for one in base])
+    seconds = _METRICS[-1]
+    return row | {f"{seconds}_ratio": statistics.fmean(values[seconds]) / statistics.fmean(one[seconds] for one in base)}
 
 
 def curves(found: Mapping[tuple[str, int], dict[str, Any]], names: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:

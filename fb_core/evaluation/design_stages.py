@@ -117,7 +117,7 @@ class DepthTaughtStage(Stage):
     def __init__(self, stage: KeptStage, *, weight: float = 0.1):
         """``weight`` of the squared error of log distances."""
         self.inner, self.network, self.weight = stage, stage.network, weight
-        self.critic = DepthHead(stage.network.config)
+        self.critic: DepthHead = DepthHead(stage.network.config)
 
     @property
     def batch(self) -> int:
