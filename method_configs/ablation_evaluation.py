@@ -103,7 +103,7 @@ def _measured(
 
     from fb_core.evaluation.ablations import evaluate_design
 
-    what = dataclasses.asdict(task) | {"autoencoders": _content_of(autoencoders), "lpips": distance is not None}
+    what = dataclasses.asdict(task) | {"autoencoders": content_of(autoencoders), "lpips": distance is not None}
     decides = {folder: json_format.loads(json_format.dumps(what | {"steps": recipe.dit_loop.steps})) for folder, recipe in folders.items()}
     measured: dict[Path, list[dict[str, float]]] = {}
     for folder in folders:
@@ -120,7 +120,7 @@ def _measured(
     return measured
 
 
-def _content_of(autoencoders: Fillerbuster) -> str:
+def content_of(autoencoders: Fillerbuster) -> str:
     """Stands for the weights that all designs share."""
     import hashlib
 

@@ -24,6 +24,7 @@ from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
 from method_configs.conditioning_evaluation import Conditioning
 from method_configs.consistency_evaluation import Consistency
+from method_configs.design_evaluation import Designs
 from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluation_command import Rooms
 from method_configs.inference_benchmark import Inference
@@ -306,6 +307,7 @@ def evaluate(
         | Annotated[Consistency, tyro.conf.subcommand("consistency")]
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
         | Annotated[Masked, tyro.conf.subcommand("masked")]
+        | Annotated[Designs, tyro.conf.subcommand("designs")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""

@@ -150,9 +150,7 @@ def _with_known_poses(photos: list[Photo], capture: Path) -> list[Photo]:
         if len(namesakes) == 1:
             posed[photo.source.name] = namesakes[0]
         elif photo.source.name in by_name:
-            _logger.warning(
-                "%s: several pictures of --known-poses have this name, none is this photo; its camera is looked for", photo.name
-            )
+            _logger.warning("%s: --known-poses has several pictures of this name, none is this photo; its camera is looked for", photo.name)
     if not any(photo.source.name in by_name for photo in photos):
         raise ValueError(
             f"--known-poses {capture}: none of its pictures has the file name of a photo, such as {photos[0].source.name}; rename them"

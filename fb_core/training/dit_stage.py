@@ -148,7 +148,7 @@ class DiTStage(Stage):
     @torch.no_grad()
     def draw(self, step: int, rows: range) -> Drawn:
         """Latents of these rows of a step's batch, on their way between data and noise."""
-        data, conditioning, image_weight, rays_weight, captions = self._encoded(step, rows)
+        data, conditioning, image_weight, rays_weight, captions = self.encoded(step, rows)
         noises, positions = ([row_generator(self.seed, step, row, stream) for row in rows] for stream in (1, 2))
         mode, (count, views, *latent), draws = self.network.config.index, data.shape, self.config.draws
         each = count // len(rows) * draws
@@ -179,15 +179,21 @@ class DiTStage(Stage):
             return times
         return torch.where(torch.rand(count, generator=generator) < self.config.pure_noise, torch.ones_like(times), times)
 
-    def _encoded(self, step: int, rows: range) -> Encoded:
+    def encoded(self, step: int, rows: range) -> Encoded:
+        """These rows of a step's batch before noise, from what is shared if anything is."""
         if self._shared is None:
-            return self._encode(step, rows)
+            return self.encode(self.sequences(step, rows), step, rows)
         frames = self.network.config.ray_frames and self.network.config.patch
-        return self._shared.get((step, rows, self.config.task, frames), lambda: self._encode(step, rows))
+        return self._shared.get((step, rows, self.config.task, frames), lambda: self.encode(self.sequences(step, rows), step, rows))
 
-    def _encode(self, step: int, rows: range) -> Encoded:
+    def sequences(self, step: int, rows: range) -> Sequences:
+        """The views of these rows of a step's batch, and what of them is known."""
         self.pool.advance(step, rows)
-        sequences = self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
+        return self.pool.sequences(rows, self.config.task, partial(row_generator, self.seed, step))
+
+    @torch.no_grad()
+    def encode(self, sequences: Sequences, step: int, rows: range) -> Encoded:
+        """Their latents, with the guesses of this step."""
         guess = guesses_of(sequences, rows, self.config.task, partial(row_generator, self.seed, step, stream=_GUESSES))
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
         data, conditioning = encode_sequences(sequences, **vaes, guess=guess, transformer=self.network.config)
