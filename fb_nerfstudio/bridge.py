@@ -39,10 +39,13 @@ def to_pinholes(cameras: Cameras) -> Pinholes:
     width, height = sizes[0].tolist()
     poses = cameras.camera_to_worlds  # whole numbers, where a camera path was written so
     poses = poses.to(torch.promote_types(poses.dtype, torch.float32))
+    focal, principal = (
+        torch.stack([x.reshape(-1), y.reshape(-1)], dim=-1) for x, y in ((cameras.fx, cameras.fy), (cameras.cx, cameras.cy))
+    )
     return Pinholes(
         camera_to_world=flip_axes(poses.reshape(-1, 3, 4)),
-        focal=torch.stack([cameras.fx.reshape(-1), cameras.fy.reshape(-1)], dim=-1),
-        principal=torch.stack([cameras.cx.reshape(-1), cameras.cy.reshape(-1)], dim=-1),
+        focal=focal.to(poses),  # some dataparsers, Blender's for one, give these in another precision
+        principal=principal.to(poses),
         width=width,
         height=height,
     )

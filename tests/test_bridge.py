@@ -60,6 +60,16 @@ def test_camera_at_identity_looks_along_minus_z() -> None:
     assert torch.equal(flip_axes(flipped), pose)
 
 
+@pytest.mark.parametrize("kind", [torch.float64, torch.float32, torch.float16])
+def test_intrinsics_of_another_precision_follow_the_poses(kind: torch.dtype) -> None:
+    """nerfstudio's Blender dataparser gives float64 ones beside float32 poses."""
+    poses = torch.eye(4)[:3].repeat(2, 1, 1)
+    lens = torch.full((2, 1), 12.5, dtype=kind)
+    found = to_pinholes(Cameras(poses, lens, lens, lens, lens, width=25, height=25))
+    assert {found.focal.dtype, found.principal.dtype, found.camera_to_world.dtype} == {torch.float32}
+    assert found.directions().dtype == torch.float32 and float(found.focal[0, 0]) == 12.5
+
+
 def test_mixed_sizes_need_the_list() -> None:
     mixed = Cameras(
         camera_to_worlds=torch.eye(4)[None, :3].repeat(2, 1, 1),

@@ -123,6 +123,20 @@ def test_other_lenses_poses_and_fields_of_view_are_refused(tmp_path: Path):
             read_camera_path(tmp_path / "path.json", size=16)
 
 
+@pytest.mark.parametrize("scale", [0.5, 2.0, 30.0])
+def test_the_scale_of_a_scaled_scene_is_divided_out(tmp_path: Path, scale: float):
+    """As nerfstudio's Blender add-on writes it: rays keep their directions, places stay."""
+    plain = read_camera_path(write_path(tmp_path / "plain.json"), size=16).cameras
+    content = json.loads((tmp_path / "plain.json").read_text())
+    for entry in content["camera_path"]:
+        matrix = torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4)
+        matrix[:3, :3] *= scale
+        entry["camera_to_world"] = matrix.flatten().tolist()
+    (tmp_path / "scaled.json").write_text(json.dumps(content))
+    scaled = read_camera_path(tmp_path / "scaled.json", size=16).cameras
+    assert torch.allclose(scaled.camera_to_world, plain.camera_to_world, atol=1e-6) and torch.equal(scaled.focal, plain.focal)
+
+
 def test_with_overlap_each_round_sees_the_captured_views_nearest_to_its_own():
     """A path that looks along the first captured view and one along the last want different context; anchors keep the spread."""
     cameras = room_cameras(12)

@@ -98,6 +98,9 @@ def _pose(entry: Any, index: int, path: Path) -> torch.Tensor:
     if not numbers:
         raise ValueError(f"{where} has no camera_to_world of 16 numbers; it is another tool's path, save one in nerfstudio's viewer")
     pose = torch.tensor(values, dtype=torch.float64).reshape(4, 4)[:3]
+    scale = torch.linalg.det(pose[:, :3]).clamp(min=0) ** (1 / 3)
+    if bool(scale.isfinite()) and float(scale) > 0:  # Blender's add-on writes the scale of a scaled scene into the rotation
+        pose[:, :3] /= scale
     rotation = pose[:, :3]
     upright = bool(torch.isfinite(pose).all()) and float((rotation.T @ rotation - torch.eye(3).double()).abs().max()) < _ORTHONORMAL
     if not upright or float(torch.linalg.det(rotation)) < 0:
