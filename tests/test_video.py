@@ -416,3 +416,40 @@ def test_a_film_that_changes_after_the_choice_is_told(tmp_path: Path) -> None:
     write_film(path, pan([0, 3]))
     with pytest.raises(ValueError, match="no longer be decoded"):
         film.load(film.frames[-1])
+
+
+def test_widths_whose_rows_have_gaps_and_the_side_that_motion_is_measured_in(tmp_path: Path) -> None:
+    """120 x 90: nothing is made smaller, so that the decoder's own rows reach the optical flow."""
+    for width, height in ((120, 90), (98, 66), (118, 120)):
+        frames = [frame[:height, :width] for frame in pan(list(range(0, 60, 6)))]
+        film = read_film(write_film(tmp_path / f"{width}.mp4", frames), 4)
+        assert film.size == (height, width) and len(film.frames) >= 2
+
+
+def test_black_frames_take_no_places(tmp_path: Path) -> None:
+    black = [np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)] * 14
+    moving = pan(list(range(0, 20 * 8, 8)))
+    film = read_film(write_film(tmp_path / "intro.mp4", [*black, *moving, *black[:3]]), 16)
+    assert len(film.frames) == 16 and {frame.number for frame in film.frames} <= set(range(14, 34))
+    still = read_film(write_film(tmp_path / "black.mp4", black), 4)
+    assert len(still.frames) == 4, "a film of nothing else is taken as it is"
+
+
+def test_the_largest_of_several_streams_is_taken(tmp_path: Path) -> None:
+    """Cameras put a small preview first."""
+    path = tmp_path / "two.mov"
+    large = pan(list(range(0, 60, 6)))
+    with av.open(str(path), "w") as container:
+        streams = []
+        for height, width in ((48, 64), (HEIGHT, WIDTH)):
+            stream = container.add_stream("libx264", rate=30)
+            stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+            streams.append(stream)
+        for array in large:
+            for stream in streams:
+                picture = np.ascontiguousarray(array[: stream.height, : stream.width])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+    film = read_film(path, 4)
+    assert film.size == (HEIGHT, WIDTH) and film.load(film.frames[0]).shape == (3, HEIGHT, WIDTH)

@@ -90,9 +90,8 @@ class MeshPool(ViewPool):
             try:
                 return Rendered(cameras, draw(read_mesh(path), cameras.to(self.device), light, supersample=self.config.supersample))
             except Exception as found:  # of trimesh and of what its materials hold: whatever it is, another file is drawn
-                _logger.warning(
-                    "left out a mesh: %s", found if isinstance(found, ValueError) else f"{path}: {type(found).__name__}: {found}"
-                )
+                told = found if isinstance(found, ValueError) else f"{path}: {type(found).__name__}: {found}"
+                _logger.warning("left out a mesh: %s", told)
                 error = found
         raise ValueError(f"meshes: {self.config.retries} files in a row could not be drawn, the last because: {error}") from error
 

@@ -27,6 +27,7 @@ FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg
 _SHARPNESS_SIDE = 480  # pixels of the longer side in which sharpness is measured: motion blur must still be seen
 _MOTION_SIDE = 120  # and motion
 _LEAST_SIDE = 32  # optical flow needs as much
+_BLANK = 2.0  # of 255, standard deviation of the brightness: below, a frame shows nothing
 _NEW_REFERENCE = 0.04  # once the picture has moved by this share of its longer side, motion is measured from here on
 _MOST_STEP = 0.25  # of the longer side: what optical flow says beyond that (a cut) is not believed
 _LEAST_COMPLETE = 0.95  # share of the frames announced by the header that must be there
@@ -124,14 +125,15 @@ def read_film(path: Path, most: int) -> Film:
         ValueError: one sentence, for a file that is no film and for a film of which fewer than two frames can be decoded.
     """
     faults: list[str] = []
-    frames, sharpness, travelled, display = _survey(path, faults)
+    frames, sharpness, travelled, blank, display = _survey(path, faults)
     fault = f" ({faults[0]})" if faults else ""
     if len(frames) < 2 or display is None:
         what = "copy it again from its source" if faults else "give a longer film or a folder of photos"
         raise ValueError(f"film {path}: expected at least 2 frames, got {len(frames)} that can be decoded{fault}; {what}")
     if faults:
         _logger.warning("film %s is damaged or truncated%s: its %d good frames are used", path, fault, len(frames))
-    chosen = choose_frames(sharpness, travelled, most)
+    shown = np.flatnonzero(~blank) if int((~blank).sum()) >= 2 else np.arange(len(frames))  # fades and black leaders show nothing
+    chosen = [int(shown[index]) for index in choose_frames(sharpness[shown], travelled[shown], most)]
     _logger.info("film %s: %d of %d frames chosen", path, len(chosen), len(frames))
     return Film(path, [frames[index] for index in chosen], display)
 
@@ -176,11 +178,12 @@ def _local_median(values: np.ndarray, reach: int = 15) -> np.ndarray:
 # ---- the first pass -------------------------------------------------------------------------------------------------
 
 
-def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray, np.ndarray, Display | None]:
-    """All frames that can be decoded, their sharpness, how far the camera has moved until each, and how they are shown."""
+def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray, np.ndarray, np.ndarray, Display | None]:
+    """All frames that can be decoded, their sharpness, how far the camera has moved until each, which are of one colour, how to show them."""
     frames: list[FilmFrame] = []
     sharpness: list[float] = []
     way: list[float] = []
+    blank: list[bool] = []
     display, start, group, odometer = None, 0.0, 0, _Odometer()
     announced, pixel_aspect = _header(path)  # refuses what is too large before anything is decoded
     for frame in _frames(path, faults):
@@ -196,9 +199,10 @@ def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray,
         grey = _small_grey(frame)
         sharpness.append(_sharpness(grey))
         way.append(odometer.moved(grey))
+        blank.append(float(grey.std()) < _BLANK)
     if frames and frames[-1].seconds < _LEAST_COMPLETE * announced - 1:
         faults.append(f"it ends after {frames[-1].seconds:.1f} of {announced:.1f} seconds")
-    return frames, np.array(sharpness), np.array(way), display
+    return frames, np.array(sharpness), np.array(way), np.array(blank, dtype=bool), display
 
 
 class _Odometer:
@@ -253,7 +257,7 @@ def _frames(path: Path, faults: list[str], *, from_pts: int | None = None) -> It
     from av.error import FFmpegError
 
     with _opened(path) as container:
-        stream = container.streams.video[0]
+        stream = _pictures(container)
         stream.thread_type = "AUTO"
         if from_pts is not None:
             container.seek(from_pts, stream=stream, backward=True)
@@ -296,13 +300,19 @@ def _opened(path: Path) -> Any:
     return container
 
 
+def _pictures(container: Any) -> Any:
+    """The video stream with the most pixels: films of some cameras begin with a small preview, and may carry a cover picture."""
+    films = [stream for stream in container.streams.video if "attached_pic" not in str(getattr(stream, "disposition", "")).lower()]
+    return max(films or container.streams.video, key=lambda stream: (stream.width or 0) * (stream.height or 0))
+
+
 def _header(path: Path) -> tuple[float, float]:
     """How many seconds the film lasts (0 = not told), and how wide a stored pixel is for its height.
 
     Raises ValueError for frames that are too large to be decoded here.
     """
     with _opened(path) as container:
-        stream = container.streams.video[0]
+        stream = _pictures(container)
         seconds = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
         pixel_aspect = float(stream.sample_aspect_ratio or 1)
         require_decodable(f"film {path}", stream.height, stream.width * pixel_aspect, _HELD_CHANNELS, most=MOST_FILM_PIXELS)
@@ -313,7 +323,8 @@ def _small_grey(frame: Any) -> np.ndarray:
     """Brightness as stored (not turned), small enough to be cheap: uint8 [h, w]."""
     scale = min(1.0, _SHARPNESS_SIDE / max(frame.width, frame.height))
     width, height = (max(_LEAST_SIDE, round(side * scale)) for side in (frame.width, frame.height))
-    return frame.reformat(width=width, height=height, format="gray8", interpolation="AREA").to_ndarray()
+    grey = frame.reformat(width=width, height=height, format="gray8", interpolation="AREA").to_ndarray()
+    return np.ascontiguousarray(grey)  # optical flow takes no rows with gaps, which some widths leave
 
 
 def _pixels(frame: Any, display: Display) -> np.ndarray:
