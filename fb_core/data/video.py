@@ -179,7 +179,7 @@ def _local_median(values: np.ndarray, reach: int = 15) -> np.ndarray:
 
 
 def _survey(path: Path, faults: list[str]) -> tuple[list[FilmFrame], np.ndarray, np.ndarray, np.ndarray, Display | None]:
-    """All frames that can be decoded, their sharpness, how far the camera has moved until each, which are of one colour, how to show them."""
+    """All frames that can be decoded, their sharpness, how far the camera has moved until each, which show nothing, and their display."""
     frames: list[FilmFrame] = []
     sharpness: list[float] = []
     way: list[float] = []

@@ -112,7 +112,7 @@ def _refined(
     from scipy.optimize import least_squares
 
     some = slice(None, None, max(1, len(first) // _ENOUGH))
-    first, second = first[some], second[some]
+    a, b = _lifted(first[some]), _lifted(second[some])
     aside = np.linalg.svd(way[None])[2][1:]  # two unit vectors across the direction
 
     def at(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +120,7 @@ def _refined(
         return cv2.Rodrigues(values[:3])[0] @ rotation, moved / np.linalg.norm(moved)
 
     def misses(values: np.ndarray) -> np.ndarray:
-        return _line_distances(first, second, *at(values))
+        return _sampson(a, b, *at(values))
 
     found: Any = least_squares(misses, np.zeros(5), loss="cauchy", f_scale=tolerance / 2, max_nfev=25)
     return at(found.x)
@@ -130,11 +130,21 @@ def _line_distances(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], rotation: Float[np.ndarray, "3 3"], way: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " m"]:
     """First order distances of matches from their epipolar lines (Sampson 1982)."""
-    across = np.array([[0, -way[2], way[1]], [way[2], 0, -way[0]], [-way[1], way[0], 0]])
-    essential = across @ rotation
-    a, b = (np.concatenate([places, np.ones((len(places), 1))], axis=1) for places in (first, second))
+    return _sampson(_lifted(first), _lifted(second), rotation, way)
+
+
+def _lifted(places: np.ndarray) -> np.ndarray:
+    """[m, 2] -> [m, 3] with a one."""
+    return np.concatenate([places, np.ones((len(places), 1))], axis=1)
+
+
+def _sampson(a: np.ndarray, b: np.ndarray, rotation: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """The distances [m] of places [m, 3]; called thousands of times, so that nothing is checked or built twice here."""
+    x, y, z = way
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
     lines, back = a @ essential.T, b @ essential
-    return np.abs((b * lines).sum(axis=1)) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1) + 1e-30)
+    spread = lines[:, 0] ** 2 + lines[:, 1] ** 2 + back[:, 0] ** 2 + back[:, 1] ** 2
+    return np.abs((b * lines).sum(axis=1)) / np.sqrt(spread + 1e-30)
 
 
 def _before(
