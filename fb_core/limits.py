@@ -50,11 +50,14 @@ def require_between(name: str, value: float, least: float, most: float) -> None:
         raise ValueError(f"{name}: expected {least:g} to {most:g}, got {_short(value)}")
 
 
-def require_whole(name: str, value: object, least: int, most: int) -> None:
-    """Raise a ValueError unless ``value`` is an integer (no truth value) with ``least <= value <= most``."""
+def require_whole(name: str, value: object, least: int, most: int | None = None) -> None:
+    """Raise a ValueError unless ``value`` is an integer (no truth value) of at least ``least``, and at most ``most`` if that is given."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise ValueError(f"{name}: expected a whole number, got {value!r:.40}")
-    require_between(name, int(value), least, most)
+    if most is None and value < least:
+        raise ValueError(f"{name}: expected at least {least}, got {_short(int(value))}")
+    if most is not None:
+        require_between(name, int(value), least, most)
 
 
 def require_model_sizes(sizes: Mapping[str, Any]) -> None:

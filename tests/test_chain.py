@@ -170,7 +170,7 @@ def test_the_user_is_told_how_many_views_condition_the_generation(chain: Chain):
 
 
 def test_going_on_generates_nothing_again(chain: Chain):
-    assert chain.calls == {"loads": [1, 0], "completions": [2, 0]}  # anchors and one round, before the kill
+    assert chain.calls == {"loads": [1, 0], "completions": [3, 0]}  # hidden views, anchors and one round, before the kill
     before, after = (chain.checkpoint(run)["pipeline"]["datamanager._extra_state"]["views"] for run in (chain.killed, chain.resumed))
     assert torch.equal(before["images"], after["images"]) and before["origins"] == after["origins"]
 

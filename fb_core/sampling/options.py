@@ -82,7 +82,7 @@ class SamplingConfig:
         require_whole("rounds", self.rounds, 1, MOST_SAMPLING_STEPS)
         for name in ("views_at_once", "window"):
             if getattr(self, name) is not None:
-                require_whole(name, getattr(self, name), 1, 2**62)
+                require_whole(name, getattr(self, name), 1)
         if self.memory_budget_bytes is not None and not self.memory_budget_bytes >= 1:
             raise ValueError(f"memory_budget_bytes: expected at least 1, got {self.memory_budget_bytes}")
         for name in ("guidance_unknown", "guidance_known", "guidance_text"):
