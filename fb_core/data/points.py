@@ -44,12 +44,28 @@ def read_points(path: str | Path) -> Points:
     except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
         raise ValueError(f"points {path}: not readable as a PLY file ({error}); restore it") from error
     finite = torch.isfinite(positions).all(dim=1)
+    colors = _stored_colors(cloud)
+    if colors is None or len(colors) != len(positions):
+        return Points(positions=positions[finite], colors=torch.full_like(positions[finite], 0.5))
+    return Points(positions=positions[finite], colors=colors[finite])
+
+
+def _stored_colors(cloud: Any) -> Float[Tensor, "m 3"] | None:
+    """Colours in [0, 1] as the file's types mean them: 8 and 16 bits of their range, others up to 1, or up to 255 if any is larger."""
+    stored = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = ("red", "green", "blue")
+    has = [] if stored is None else list(stored.dtype.names or ()) if isinstance(stored, np.ndarray) else list(stored)
+    if stored is not None and set(names) <= set(has):
+        values = np.stack([np.asarray(stored[name]).reshape(-1) for name in names], axis=1)
+        tops = {"uint8": 255.0, "uint16": 65535.0}
+        colors = torch.from_numpy(values.astype(np.float64))
+        finite = colors[torch.isfinite(colors).all(dim=1)]
+        top = tops.get(values.dtype.name, 255.0 if len(finite) and float(finite.max()) > 1 else 1.0)
+        return (colors / top).nan_to_num(0.5).clamp(0, 1)
     colors = getattr(cloud, "colors", None)
     if colors is None and getattr(getattr(cloud, "visual", None), "kind", None) == "vertex":
         colors = cloud.visual.vertex_colors
-    if colors is None or len(colors) != len(positions):
-        return Points(positions=positions[finite], colors=torch.full_like(positions[finite], 0.5))
-    return Points(positions=positions[finite], colors=(torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255)[finite])
+    return None if colors is None else torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255
 
 
 def require_points(path: str | Path) -> None:
