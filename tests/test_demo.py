@@ -144,7 +144,8 @@ def test_a_demo_whose_training_failed_can_be_run_again(pretend_ns_train, tmp_pat
     for _ in range(2):
         with pytest.raises(ValueError, match="ended with code 3: out of memory"):
             demo.run_demo(tmp_path / "demo", iterations=10)
-        assert (tmp_path / "demo" / "runs" / "fillerbuster.log").read_text().strip() == "out of memory"
+        said = [log.read_text().strip() for log in (tmp_path / "demo" / "runs").glob("*.log")]
+        assert "out of memory" in said  # the other training is stopped, and may not have said anything yet
 
 
 @pytest.mark.parametrize(
