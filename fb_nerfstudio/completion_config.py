@@ -82,7 +82,7 @@ class CompletionConfig:
     """Rounds after the anchors, each conditioned on the context and the anchors."""
     densify_views: int = 24
     """Views generated together in each of these rounds."""
-    least_gain: float = 0.02
+    least_gain: float = 0.003
     """Where the capture decides (`anchor_views` None): share of what it has not seen that a further view must show, from 0 to 1."""
     camera_path: Path | None = None
     """Camera path saved in nerfstudio's viewer (Render tab): generate these views, where they are, instead of placing cameras."""
