@@ -260,7 +260,7 @@ def test_the_saved_folder_is_a_valid_capture_that_says_how_it_was_made(tmp_path:
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("context_views", 0), ("image_size", 8), ("generated_share", 1.5), ("steps", 1), ("at_step", -1), ("view_weight", -1.0)],
+    [("context_views", 0), ("image_size", 8), ("generated_share", 1.5), ("steps", 0), ("at_step", -1), ("view_weight", -1.0)],
 )
 def test_nonsense_options_are_refused(option: str, value):
     with pytest.raises(ValueError, match=option):

@@ -413,3 +413,9 @@ def test_eight_views_at_128_take_a_fraction_of_the_budget():
     room = make_room(0, FAMILIES["narrow"])
     render(room, training_cameras(room, 8, size=128, generator=torch.Generator().manual_seed(0)), supersample=2)
     assert time.process_time() - start < 2 * 8 / 64 * 20
+
+
+@pytest.mark.parametrize("asked", [{"views": 10**9}, {"size": 10**6}, {"held_out": 10**8}, {"views": 10**4, "size": 10**4}])
+def test_more_pixels_than_anybody_can_hold_are_refused_before_anything_is_drawn(asked: dict) -> None:
+    with pytest.raises(ValueError, match="million pixels in all views together"):
+        casual_capture(0, **asked)

@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 _GRID = 32  # covered shares are measured on at most this many pixels squared
 _POINTS_PER_CAPTURE = 6000  # pixels tried; those seen by two views become points
 _POINT_NOISE_METRES = 0.005
+_MOST_PIXELS = 2**26  # of all views, which are drawn together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +70,12 @@ def casual_capture(seed: int, *, family: str = "narrow", views: int = 24, size: 
     for name, value, least in (("seed", seed, 0), ("views", views, 2), ("size", size, 16), ("held_out", held_out, 2)):
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")
+    pixels = (views + held_out) * size * size  # all views are drawn at once, four rays a pixel
+    if pixels > _MOST_PIXELS:
+        raise ValueError(
+            f"views, held_out and size: expected at most {_MOST_PIXELS / 1e6:.0f} million pixels in all views together, "
+            f"got {pixels / 1e6:,.0f} million; ask for fewer or smaller views"
+        )
     room = make_room(seed, FAMILIES[family])
     generator = torch.Generator().manual_seed(seed)
     low, high = room.family.fov_degrees
