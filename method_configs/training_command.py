@@ -20,6 +20,7 @@ import torch
 from fb_core.checkpoint import model_target, require_model_or_free
 from fb_core.data.training_data import TrainingData
 from fb_core.limits import MOST_TRAINING_STEPS, require_between
+from fb_core.training.checkpoints import read_state
 from fb_core.training.distributed import Group, joined
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.loop import EngineConfig, OnProgress
@@ -140,7 +141,7 @@ def _steps_done(folder: Path) -> int:
     """Steps that the stage's checkpoint has behind it; 0 without one."""
     path = folder / "checkpoint.pt"
     complete = path.exists() and (folder.name == "dit" or (folder / "spread.json").exists())  # killed while measuring its latents
-    return torch.load(path, weights_only=True, map_location="cpu", mmap=True)["step"] if complete else 0
+    return read_state(path, mapped=True)["step"] if complete else 0
 
 
 def _require_positive(**values: float | None) -> None:

@@ -20,6 +20,7 @@ from tiny_training import LOOP, TOY, TinyStage, losses_of, run_in
 
 from fb_core.networks.dit import DiT
 from fb_core.training import dry_run
+from fb_core.training.checkpoints import read_state
 from fb_core.training.distributed import ALONE
 from fb_core.training.loop import EngineConfig, LoopConfig, Run, Stage
 from fb_core.training.progress_log import ProgressLog
@@ -310,3 +311,20 @@ def test_sheets_show_an_unseen_room(tmp_path, stage):
     width, height = Image.open(tmp_path / "000003.png").size
     assert width > 300 and height > 200 and task.network.training
     assert list(measured) == (["val"] if stage == "dit" else ["mean_error"]) and all(0 < value < 10 for value in measured.values())
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04" + bytes(64)])
+def test_what_is_no_checkpoint_is_one_sentence(tmp_path, content):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"checkpoint.pt is damaged \(.*\); restore it"):
+        read_state(path)
+
+
+@pytest.mark.parametrize("content", [[1, 2], {}, {"step": "7"}, {"step": True}])
+def test_a_file_of_something_else_is_one_sentence(tmp_path, content):
+    path = tmp_path / "checkpoint.pt"
+    torch.save(content, path)
+    for mapped in (False, True):
+        with pytest.raises(ValueError, match="is no checkpoint of a training: it tells no step"):
+            read_state(path, mapped=mapped)

@@ -13,6 +13,22 @@ from fb_core.files.whole import whole_file
 NEWEST = "checkpoint.pt"
 
 
+def read_state(
+    path: Path, device: torch.device | str = "cpu", *, advice: str = "restore it, or delete it to begin anew", mapped: bool = False
+) -> dict[str, Any]:
+    """A checkpoint's content; ``mapped`` leaves its tensors on disk until they are used. Nothing in the file is executed.
+
+    Raises ValueError in one sentence, which ends with the ``advice``, for a file that is damaged or no checkpoint of a training.
+    """
+    try:
+        state = torch.load(path, weights_only=True, map_location=device, mmap=mapped or None)
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path} is damaged ({' '.join(str(error).split())[:300]}); {advice}") from error
+    if not isinstance(state, dict) or isinstance(state.get("step"), bool) or not isinstance(state.get("step"), int):
+        raise ValueError(f"{path} is no checkpoint of a training: it tells no step; {advice}")
+    return state
+
+
 class Checkpoints:
     """``checkpoint.pt`` in a folder is the newest; ``checkpoint-000200.pt`` are those before it, named by their steps."""
 
@@ -27,12 +43,8 @@ class Checkpoints:
 
     def read(self, path: Path, device: torch.device) -> dict[str, Any]:
         """A checkpoint's content. Raises ValueError if the file is damaged, naming the one before it."""
-        try:
-            state = torch.load(path, weights_only=True, map_location=device)
-        except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-            before = [str(other) for other in self._earlier() if other != path]
-            advice = f"delete it to go on from {before[-1]}" if before else "delete it to begin anew"
-            raise ValueError(f"{path} is damaged ({error}); {advice}") from error
+        before = [str(other) for other in self._earlier() if other != path]
+        state = read_state(path, device, advice=f"delete it to go on from {before[-1]}" if before else "delete it to begin anew")
         self._newest_step = state["step"]
         return state
 

@@ -24,7 +24,7 @@ from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import Network
 from fb_core.sampler import SamplingConfig
-from fb_core.training.checkpoints import Checkpoints
+from fb_core.training.checkpoints import Checkpoints, read_state
 from fb_core.training.distributed import ALONE, Group
 from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
 from fb_core.training.linear_start import start_linear
@@ -323,6 +323,11 @@ def _load_average(network: nn.Module, folder: Path, preset: str, stage: str) -> 
     path = folder / "checkpoint.pt"
     if not path.exists():
         raise ValueError(f"stage {stage!r} of preset {preset!r} is not trained yet ({path} is missing); train that stage first")
-    state = torch.load(path, weights_only=True, map_location="cpu")
-    network.load_state_dict(state["average"])
-    return {"stage": stage, "steps": state["step"], "seconds": round(state["seconds"]), "losses": state["smoothed"]}
+    state = read_state(path)
+    try:
+        network.load_state_dict(state["average"])
+        return {"stage": stage, "steps": state["step"], "seconds": round(state["seconds"]), "losses": state["smoothed"]}
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(
+            f"{path} holds no finished stage {stage!r} of preset {preset!r} ({' '.join(str(error).split())[:200]}); train that stage again"
+        ) from error
