@@ -152,6 +152,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             CONSOLE.print(announcement_of_brought(brought, self.config.completion))
         self.completion_panel.training_begins(takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views")
         given = training_callback_attributes
+        if given.trainer is not None and self.config.completion.enabled and not self._finished:
+            self._say_if_it_ends_before(given.trainer)
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
         return [
             *super().get_training_callbacks(given),
@@ -159,6 +161,15 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             TrainingCallback([before], self._serve_next_request, args=[given]),
             TrainingCallback([after], lambda step: self.completion_panel.training_ended()),
         ]
+
+    def _say_if_it_ends_before(self, trainer: Any) -> None:
+        """One sentence where the training is over before views are due."""
+        due, last = self.config.completion.at_step, trainer._start_step + trainer.config.max_num_iterations
+        if due >= last:
+            CONSOLE.print(
+                f"Views are generated before step {due} (completion.at_step), but this training ends with step {last - 1}: none will be "
+                f"generated. Train longer, or set --pipeline.datamanager.completion.at-step below {last}."
+            )
 
     def _complete_when_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         completion = self.config.completion

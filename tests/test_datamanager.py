@@ -73,7 +73,8 @@ class ToyTrainer:
 
     def __init__(self, folder: Path, pipeline) -> None:
         self.base_dir, self.checkpoint_dir, self.pipeline = folder, folder / "nerfstudio_models", pipeline
-        self.config = SimpleNamespace(save_only_latest_checkpoint=True)
+        self.config = SimpleNamespace(save_only_latest_checkpoint=True, max_num_iterations=30_000)
+        self._start_step = 0
 
     def save_checkpoint(self, step: int) -> None:
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
@@ -124,6 +125,16 @@ def generated(manager: FillerbusterDataManager, folder: Path | None = None, step
     attrs = attributes(manager, folder)
     run_callbacks(manager, attrs, step)
     return attrs
+
+
+@pytest.mark.parametrize(("start", "steps", "said"), [(0, 500, True), (0, 501, False), (400, 100, True), (400, 101, False)])
+def test_a_training_that_ends_before_views_are_due_says_so(tiny_capture, tmp_path, capsys, start, steps, said):
+    manager = make(tiny_capture, options(at_step=500))
+    attrs = attributes(manager, tmp_path)
+    attrs.trainer.config.max_num_iterations, attrs.trainer._start_step = steps, start
+    manager.get_training_callbacks(attrs)
+    told = " ".join(capsys.readouterr().out.split())
+    assert ("none will be generated. Train longer, or set --pipeline.datamanager.completion.at-step below 500" in told) == said
 
 
 def test_the_model_is_tried_once_and_views_are_believed_accordingly(tiny_capture, tmp_path, capsys):

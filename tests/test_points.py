@@ -50,3 +50,13 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     write_points(tmp_path / "p.ply", points)
     again = read_points(tmp_path / "p.ply")
     assert torch.allclose(again.positions, points.positions, atol=1e-6) and torch.allclose(again.colors, points.colors, atol=0.51 / 255)
+
+
+def test_a_header_that_promises_more_than_the_file_holds_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "p.ply", "uchar", binary=True)
+    for count in (10**6, 10**12, 10**30):
+        path.write_bytes(path.read_bytes().replace(b"element vertex 2", b"element vertex %d" % count))
+        with pytest.raises(ValueError, match=r"its header promises .* of vertex, more than its"):
+            read_points(path)
+        path.write_bytes(path.read_bytes().replace(b"element vertex %d" % count, b"element vertex 2"))
+    assert len(read_points(path)) == 2

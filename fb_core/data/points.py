@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+_HEADER_BYTES = 2**16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,12 +72,20 @@ def _stored_colors(cloud: Any) -> Float[Tensor, "m 3"] | None:
 
 
 def require_points(path: str | Path) -> None:
-    """Raises ValueError for a file that does not begin as a PLY file does, such as the pointer that Git LFS leaves in its place."""
+    """Raises ValueError for a file that does not begin as a PLY file does, such as the pointer that Git LFS leaves in its place, and for
+    one whose header promises more than the file holds. Only the header is read."""
     with Path(path).open("rb") as file:
-        start = file.read(64)
+        start = file.read(_HEADER_BYTES)
     if not start.startswith(b"ply"):
         lfs = ", but the pointer of a file that Git LFS keeps: git lfs pull" if start.startswith(b"version https://git-lfs") else ""
         raise ValueError(f"points {path}: expected a PLY file, which this is not{lfs}; restore it, or remove ply_file_path")
+    size = Path(path).stat().st_size
+    for kind, count in re.findall(rb"^element\s+(\S+)\s+(\d+)", start.partition(b"end_header")[0], flags=re.MULTILINE):
+        if int(count[:20]) > size:  # each takes a byte at least
+            what = kind.decode(errors="replace")[:20]
+            raise ValueError(
+                f"points {path}: its header promises {int(count[:20]):,} of {what}, more than its {size:,} bytes hold; copy it again"
+            )
 
 
 def write_points(path: str | Path, points: Points) -> None:
