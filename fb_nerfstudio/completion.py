@@ -205,6 +205,8 @@ def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, 
 def announcement(plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None) -> str:
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left; two where the capture decides."""
     if plan.covered is not None and not plan.rounds:
+        if plan.covered[1] > plan.covered[0]:
+            return "The splats show all that new views would show already, so no view is generated."
         return f"The capture shows {plan.covered[0]:.0%} of what surrounds it, so no view is generated."
     context = max(len(plan.context_of(one)) for one in plan.rounds)
     asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"

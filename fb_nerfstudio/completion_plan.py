@@ -87,6 +87,15 @@ class CompletionPlan:
         """How many views will be generated."""
         return sum(len(one.cameras) for one in self.rounds)
 
+    def without(self, useless: Sequence[Bool[Tensor, "_n"]]) -> CompletionPlan:
+        """The plan without some views of each round; rounds that have none left are gone, the others keep their numbers and seeds."""
+        rounds = [
+            dataclasses.replace(planned, cameras=planned.cameras[(~gone).nonzero()[:, 0].tolist()])
+            for planned, gone in zip(self.rounds, useless, strict=True)
+            if not bool(gone.all())
+        ]
+        return dataclasses.replace(self, rounds=tuple(rounds))
+
     def context_of(self, planned: PlannedRound) -> tuple[int, ...]:
         """Places in ``context`` of the views that condition a round."""
         return tuple(range(len(self.context)) if planned.context is None else map(self.context.index, planned.context))

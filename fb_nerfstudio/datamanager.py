@@ -30,7 +30,7 @@ from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
 from fb_nerfstudio.first_guess import first_guess
-from fb_nerfstudio.fitting_in import fitted_in
+from fb_nerfstudio.fitting_in import fitted_in, needed_by_splats
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
@@ -220,6 +220,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             plan = plan_inpainting(cameras, points, config, size=size)
         else:
             plan = plan_completion(cameras, points, config, size=size, known=self.known_parts)
+            if plan.covered is not None and step >= TRAINED_STEPS:
+                plan = needed_by_splats(plan, splats, cameras, self.known_parts)
         done, _ = without_requested(self.generated_views)
         if not plan.rounds and plan.covered is not None:
             CONSOLE.print(announcement(plan, config, model))

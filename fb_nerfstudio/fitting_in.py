@@ -15,7 +15,19 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.completion_config import CompletionConfig
-from fb_nerfstudio.unseen import SOLID, coarse, find_unseen, render_geometry, unseen_gaussians, with_matched_colors, with_unseen_masks
+from fb_nerfstudio.completion_plan import CompletionPlan
+from fb_nerfstudio.unseen import (
+    SOLID,
+    coarse,
+    find_unseen,
+    render_geometry,
+    unseen_from,
+    unseen_gaussians,
+    with_matched_colors,
+    with_unseen_masks,
+)
+
+_LEAST_UNSEEN = 0.02  # of a view's pixels: with fewer to train on it is not generated
 
 
 def fitted_in(
@@ -63,3 +75,14 @@ def fitted_in(
     generator = torch.Generator().manual_seed(config.seed)
     points, colors = unseen_gaussians(views, unseen, limit=config.max_seed_gaussians, generator=generator)
     return views, splats.add_gaussians(points, colors, optimizers) if len(points) else 0
+
+
+def needed_by_splats(
+    plan: CompletionPlan, splats: Any, captured: Sequence[Pinholes], known: Sequence[Bool[torch.Tensor, "_h _w"] | None]
+) -> CompletionPlan:
+    """The plan without the views of which the capture shows all, as far as trained splats tell: nothing of them would be trained on."""
+    useless = []
+    for planned in plan.rounds:
+        unseen = unseen_from(planned.cameras, captured, plan.shell, render_geometry(splats, coarse(planned.cameras)), known)
+        useless.append(unseen.mask.flatten(1).float().mean(dim=1) < _LEAST_UNSEEN)
+    return plan.without(useless)

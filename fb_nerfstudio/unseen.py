@@ -126,8 +126,19 @@ def find_unseen(
         rendered: the splats from the views' cameras made coarse, or None while they are untrained.
         known: of each captured picture :func:`coarse_mask`; without, all of them are known.
     """
+    return unseen_from(views.cameras, captured, shell, rendered, known)
+
+
+def unseen_from(
+    new: Pinholes,
+    captured: Sequence[Pinholes],
+    shell: Shell,
+    rendered: Rendered | None,
+    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+) -> Unseen:
+    """:func:`find_unseen` of cameras, whose pictures need not be there yet."""
     origin = shell.center.to("cpu", torch.float64)
-    cameras = _about(coarse(views.cameras), origin)
+    cameras = _about(coarse(new), origin)
     directions = cameras.directions()
     origins = cameras.centers[:, None, None].expand_as(directions)
     around = Shell(center=torch.zeros(3).to(origins), log_radius=shell.log_radius.to(origins))
@@ -145,7 +156,7 @@ def find_unseen(
         wider = None if known is None else [None if mask is None else _widened_mask(mask) for mask in known]
         beside = seen_by([_widened(camera) for camera in nearby], flat, wider).reshape(covered.shape)
         inside |= beside & (rendered.accumulation >= FIRM)
-    return Unseen(mask=~(covered & inside), points=(points + origin).to(views.cameras.camera_to_world.dtype))
+    return Unseen(mask=~(covered & inside), points=(points + origin).to(new.camera_to_world.dtype))
 
 
 def _about(cameras: Pinholes, origin: Float[Tensor, "3"]) -> Pinholes:

@@ -137,6 +137,28 @@ def test_a_training_that_ends_before_views_are_due_says_so(tiny_capture, tmp_pat
     assert ("none will be generated. Train longer, or set --pipeline.datamanager.completion.at-step below 500" in told) == said
 
 
+@pytest.mark.parametrize("opaque", [1.0, 0.5])
+def test_views_of_which_trained_splats_show_all_are_not_generated(tiny_capture, capsys, opaque):
+    """The capture decides, and the splats know better than its shell: an orbit that sees all sides of an object needs nothing."""
+    manager = make(tiny_capture, options(anchor_views=None, at_step=200, least_gain=0.0))
+    attrs = attributes(manager)
+    everywhere = attrs.pipeline.model.get_outputs_for_camera
+
+    def shown(camera):
+        outputs = everywhere(camera)
+        accumulation = torch.zeros_like(outputs["accumulation"])
+        accumulation[:, : int(opaque * accumulation.shape[1])] = 1.0
+        return outputs | {"accumulation": accumulation, "depth": torch.full_like(accumulation, 2.0)}
+
+    attrs.pipeline.model.get_outputs_for_camera = shown
+    run_callbacks(manager, attrs, 200)
+    told = " ".join(capsys.readouterr().out.split())
+    if opaque == 1.0:
+        assert GreyFiller.calls == 0 and manager.generated_views is None and "no view is generated" in told
+    else:
+        assert GreyFiller.calls > 0 and all(bool(mask.any()) for mask in manager.generated_views.masks)
+
+
 def test_the_model_is_tried_once_and_views_are_believed_accordingly(tiny_capture, tmp_path, capsys):
     manager = make(tiny_capture, options(context_views=4, trust="measured"))
     generated(manager, tmp_path)
