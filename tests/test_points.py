@@ -60,3 +60,10 @@ def test_a_header_that_promises_more_than_the_file_holds_is_refused_before_anyth
             read_points(path)
         path.write_bytes(path.read_bytes().replace(b"element vertex %d" % count, b"element vertex 2"))
     assert len(read_points(path)) == 2
+
+
+def test_points_without_colours_are_grey(tmp_path: Path) -> None:
+    path = tmp_path / "p.ply"
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 1 2\n")
+    points = read_points(path)
+    assert points.positions.tolist() == [[0.0, 1.0, 2.0]] and points.colors.tolist() == [[0.5, 0.5, 0.5]]

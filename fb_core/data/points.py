@@ -68,7 +68,8 @@ def _stored_colors(cloud: Any) -> Float[Tensor, "m 3"] | None:
     colors = getattr(cloud, "colors", None)
     if colors is None and getattr(getattr(cloud, "visual", None), "kind", None) == "vertex":
         colors = cloud.visual.vertex_colors
-    return None if colors is None else torch.from_numpy(np.array(colors[:, :3], dtype=np.float64)) / 255
+    values = np.asarray([] if colors is None else colors, dtype=np.float64)  # trimesh gives an empty row where there are none
+    return torch.from_numpy(values[:, :3]) / 255 if values.ndim == 2 and values.shape[1] >= 3 else None
 
 
 def require_points(path: str | Path) -> None:
