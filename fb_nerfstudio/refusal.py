@@ -53,7 +53,7 @@ def refuse_bad_capture(config: Any) -> None:
     if not capture.photos.frames:
         raise Refused(f"capture {capture.root}: all of its {len(capture)} frames are marked as generated; give a capture with photos")
     scale = config.camera_res_scale_factor
-    for frame in capture.frames:
+    for frame in capture.photos.frames:  # generated views keep their size
         width, height = int(frame.camera.width * scale), int(frame.camera.height * scale)
         if min(width, height) < SIDE_MULTIPLE:
             scaled = "" if scale == 1 else f" after --pipeline.datamanager.camera-res-scale-factor {scale:g}"

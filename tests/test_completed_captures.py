@@ -256,3 +256,17 @@ def test_a_capture_without_photos_is_refused(tmp_path: Path):
     (data / "transforms.json").write_text(json.dumps(meta))
     with pytest.raises(Refused, match="all of its 2 frames are marked as generated"):
         make(data)
+
+
+def test_small_generated_views_are_no_reason_to_refuse_small_photos(capture: Path, tmp_path: Path):
+    """The quickstart's scale of photos would make pictures of 2 pixels of generated views, which keep their size."""
+    config = FillerbusterDataManagerConfig(
+        data=capture,
+        dataparser=NerfstudioDataParserConfig(),
+        completion=CompletionConfig(steps=2),
+        start_points=0,
+        camera_res_scale_factor=0.7,
+    )
+    manager = config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    run_callbacks(manager, attributes(manager, tmp_path / "run"))
+    assert manager.cached_train[0]["image"].shape[:2] == (16, 16) and manager.generated_views.images.shape[1:3] == (16, 16)
