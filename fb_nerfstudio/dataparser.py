@@ -165,17 +165,16 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         types = [CAMERA_MODEL_TO_TYPE[frame.camera_model] for frame in frames]
         radius = capture.extra.get("fisheye_crop_radius")
         bent = any(frame.camera_model in FISHEYE_MODELS for frame in capture.frames)
-        numbers = torch.tensor([[*frame.camera.focal[0].tolist(), *frame.camera.principal[0].tolist()] for frame in frames])
-        sizes = torch.tensor([[frame.camera.height, frame.camera.width] for frame in frames], dtype=torch.int32)
+        numbers = torch.tensor([[*frame.camera.focal[0].tolist(), *frame.camera.principal[0].tolist()] for frame in frames]).reshape(-1, 4)
+        sizes = torch.tensor([[frame.camera.height, frame.camera.width] for frame in frames], dtype=torch.int32).reshape(-1, 2)
         one_type = types[0] if len(set(types)) == 1 else None if types else CameraType.PERSPECTIVE
-        numbers = numbers.reshape(len(frames), 4)
         cameras = Cameras(
             fx=numbers[:, 0], fy=numbers[:, 1], cx=numbers[:, 2], cy=numbers[:, 3],
             distortion_params=torch.stack([camera_utils.get_distortion_params(**lens) for lens in lenses])
             if lenses
             else torch.zeros(0, 6),
-            height=sizes.reshape(-1, 2)[:, 0],
-            width=sizes.reshape(-1, 2)[:, 1],
+            height=sizes[:, 0],
+            width=sizes[:, 1],
             camera_to_worlds=poses,
             camera_type=one_type if one_type is not None else torch.tensor([[one.value] for one in types]),
             metadata={"fisheye_crop_radius": radius} if bent and radius is not None else {},

@@ -21,7 +21,6 @@ from fb_nerfstudio.unseen import (
     coarse,
     find_unseen,
     render_geometry,
-    unseen_from,
     unseen_gaussians,
     with_matched_colors,
     with_unseen_masks,
@@ -63,7 +62,7 @@ def fitted_in(
     if not places and config.generated_pixels == "all":
         return views, 0
     rendered = render_geometry(splats, coarse(views.cameras)) if trained else None
-    unseen = find_unseen(views, captured, shell, rendered, known)
+    unseen = find_unseen(views.cameras, captured, shell, rendered, known)
     if config.match_colors and rendered is not None:
         views = with_matched_colors(views, unseen, rendered)
     if config.generated_pixels == "unseen":
@@ -83,6 +82,6 @@ def needed_by_splats(
     """The plan without the views of which the capture shows all, as far as trained splats tell: nothing of them would be trained on."""
     useless = []
     for planned in plan.rounds:
-        unseen = unseen_from(planned.cameras, captured, plan.shell, render_geometry(splats, coarse(planned.cameras)), known)
+        unseen = find_unseen(planned.cameras, captured, plan.shell, render_geometry(splats, coarse(planned.cameras)), known)
         useless.append(unseen.mask.flatten(1).float().mean(dim=1) < _LEAST_UNSEEN)
     return plan.without(useless)

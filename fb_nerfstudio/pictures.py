@@ -23,7 +23,7 @@ class CapturePictures(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """[h, w, 3 or 4] of the camera's size. Raises ValueError in one sentence for a file that cannot be read."""
         path = self._dataparser_outputs.image_filenames[image_idx]
-        pixels, alpha = media.read_image_with_alpha(path, apply_orientation=self._lies_on_its_side(image_idx))
+        pixels, alpha = media.read_image_with_alpha(path, apply_orientation=self._turned(image_idx))
         channels = pixels if alpha is None else torch.cat([pixels, alpha])
         picture = Image.fromarray((channels.clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).numpy())
         if self.scale_factor != 1.0:
@@ -40,7 +40,7 @@ class CapturePictures(InputDataset):
         data: dict[str, Any] = {"image_idx": image_idx, "image": image}
         masks = self._dataparser_outputs.mask_filenames
         if masks is not None:
-            known = media.read_mask(masks[image_idx], apply_orientation=self._lies_on_its_side(image_idx))[0]
+            known = media.read_mask(masks[image_idx], apply_orientation=self._turned(image_idx))[0]
             picture = Image.fromarray((known.numpy() * 255).astype(np.uint8))
             if picture.size != (image.shape[1], image.shape[0]):
                 picture = picture.resize((image.shape[1], image.shape[0]), resample=Image.Resampling.NEAREST)
@@ -50,9 +50,7 @@ class CapturePictures(InputDataset):
                 data["image"] = torch.where(data["mask"], image, shade.to(image.dtype))
         return data | self.get_metadata(data)
 
-    def _lies_on_its_side(self, image_idx: int) -> bool:
-        """Whether the camera counts the pixels of the upright picture: posed pictures are counted as stored, unless only that fits."""
-        path = self._dataparser_outputs.image_filenames[image_idx]
+    def _turned(self, image_idx: int) -> bool:
+        """Whether picture and mask are turned as the picture's EXIF tag says."""
         camera = self._dataparser_outputs.cameras[image_idx]
-        size = (int(camera.height), int(camera.width))
-        return media.image_size(path, apply_orientation=False) != size and media.image_size(path) == size
+        return media.fits_only_upright(self._dataparser_outputs.image_filenames[image_idx], (int(camera.height), int(camera.width)))

@@ -107,36 +107,25 @@ def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:
 
 
 def find_unseen(
-    views: CompletedViews,
-    captured: Sequence[Pinholes],
-    shell: Shell,
-    rendered: Rendered | None,
-    known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
-) -> Unseen:
-    """Which pixels of generated views show what the capture has not.
-
-    A pixel is seen when its surface point falls into the known part of a captured picture and, if ``rendered`` tells, splats cover it.
-    Just beside the captured pictures firm splats are believed too: they continue what was captured better than a generated picture
-    would. The surface point is the splats' where they cover the pixel and the shell's elsewhere.
-
-    Args:
-        views: the generated views.
-        captured: the capture's cameras.
-        shell: the guessed surface, for depth.
-        rendered: the splats from the views' cameras made coarse, or None while they are untrained.
-        known: of each captured picture :func:`coarse_mask`; without, all of them are known.
-    """
-    return unseen_from(views.cameras, captured, shell, rendered, known)
-
-
-def unseen_from(
     new: Pinholes,
     captured: Sequence[Pinholes],
     shell: Shell,
     rendered: Rendered | None,
     known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
 ) -> Unseen:
-    """:func:`find_unseen` of cameras, whose pictures need not be there yet."""
+    """Which pixels of views from new cameras show, or would show, what the capture has not.
+
+    A pixel is seen when its surface point falls into the known part of a captured picture and, if ``rendered`` tells, splats cover it.
+    Just beside the captured pictures firm splats are believed too: they continue what was captured better than a generated picture
+    would. The surface point is the splats' where they cover the pixel and the shell's elsewhere.
+
+    Args:
+        new: the views' cameras; their pictures need not be there yet.
+        captured: the capture's cameras.
+        shell: the guessed surface, for depth.
+        rendered: the splats from the views' cameras made coarse, or None while they are untrained.
+        known: of each captured picture :func:`coarse_mask`; without, all of them are known.
+    """
     origin = shell.center.to("cpu", torch.float64)
     cameras = _about(coarse(new), origin)
     directions = cameras.directions()

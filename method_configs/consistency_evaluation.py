@@ -84,16 +84,12 @@ class Consistency(TableFiles):
 
     def _judged(self, run: Path, matcher: Matcher) -> dict[str, Any]:
         """``pairs`` of each method as plain values (the run's and the true film's), the ``capture``'s name, the ``model``'s hash."""
-        from method_configs.finished_run import read_run
+        from method_configs.finished_run import capture_of, identity_of, read_run
 
         config, state = read_run(run)
-        capture = Path(config.pipeline.datamanager.data or config.data or config.pipeline.datamanager.dataparser.data)
-        checkpoint = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))[-1].stat()
+        capture = capture_of(config)
         options = ("seed", "path", "seconds", "fps", "pairs", "size", "fov", "true_film")
-        asked = {name: getattr(self, name) for name in options} | {
-            "run": str(run.absolute()), "step": state["step"], "checkpoint": [checkpoint.st_size, checkpoint.st_mtime_ns],
-            "matcher": str(self.loftr or "SIFT"),
-        }  # fmt: skip
+        asked = {name: getattr(self, name) for name in options} | identity_of(run, state) | {"matcher": str(self.loftr or "SIFT")}
         del state
         name = scene_name(capture)
         file = f"{config.method_name}-{name}-{_digest(asked['run'])}"

@@ -63,6 +63,17 @@ def read_run(run: Path) -> tuple[Any, dict[str, Any]]:
     return config, state
 
 
+def capture_of(config: Any) -> Path:
+    """Where the capture of a run lies, by its options."""
+    return Path(config.pipeline.datamanager.data or config.data or config.pipeline.datamanager.dataparser.data)
+
+
+def identity_of(run: Path, state: dict[str, Any]) -> dict[str, Any]:
+    """What tells the latest checkpoint of a run that was read, whose content is ``state``, from every other, in what JSON can hold."""
+    file = _checkpoints(run)[-1].stat()
+    return {"run": str(run.absolute()), "step": state["step"], "checkpoint": [file.st_size, file.st_mtime_ns]}
+
+
 def _require_our_parts(run: Path, config: Any) -> None:
     """Raises ValueError for options of another pipeline, datamanager or model than ours, before any of them is built."""
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
@@ -84,7 +95,12 @@ def _latest_checkpoint(run: Path) -> Path:
     """The file. Raises ValueError when there is no run in the folder, or no checkpoint."""
     if not (run / "config.yml").is_file():
         raise ValueError(f"run {run}: no config.yml there; give the folder that ns-train has made (output/experiment/method/time)")
-    checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
+    checkpoints = _checkpoints(run)
     if not checkpoints:
         raise ValueError(f"run {run}: it has no checkpoint yet; let it train on")
     return checkpoints[-1]
+
+
+def _checkpoints(run: Path) -> list[Path]:
+    """From the oldest to the latest."""
+    return sorted((run / "nerfstudio_models").glob("step-*.ckpt"))

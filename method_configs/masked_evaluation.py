@@ -155,19 +155,12 @@ def require_masks(data: Path) -> None:
 
 def masked_row(run: Path, files: Masked | Paper) -> dict[str, Any]:
     """One run, as a row of table 1."""
-    from method_configs.finished_run import read_run
+    from method_configs.finished_run import capture_of, identity_of, read_run
 
     config, state = read_run(run)
     step, model = state["step"], config.pipeline.model
     normals = step > model.normal_loss_from and max(model.normal_alignment_weight, model.normal_tv_weight) > 0
-    capture = Path(config.pipeline.datamanager.data or config.data or config.pipeline.datamanager.dataparser.data)
-    checkpoint = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))[-1].stat()
-    asked = {
-        "run": str(run.absolute()),
-        "step": step,
-        "checkpoint": [checkpoint.st_size, checkpoint.st_mtime_ns],
-        "lpips": str(files.lpips),
-    }
+    capture, asked = capture_of(config), identity_of(run, state) | {"lpips": str(files.lpips)}
     measured = files.kept(
         f"{config.method_name}-{scene_name(capture)}-{NORMALS[normals]}-normals", asked, lambda: _agreement(run, files.lpips)
     )

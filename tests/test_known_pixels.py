@@ -158,8 +158,8 @@ def test_pixels_masked_out_in_the_capture_are_unseen_in_generated_views(trained:
     rendered = None
     if trained:
         rendered = Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=torch.ones(2, 8, 8), rgb=torch.full((2, 3, 8, 8), 0.5))
-    whole = find_unseen(views, [captured], sphere(torch.zeros(3), 3.0), rendered)
-    unseen = find_unseen(views, [captured], sphere(torch.zeros(3), 3.0), rendered, [known])
+    whole = find_unseen(views.cameras, [captured], sphere(torch.zeros(3), 3.0), rendered)
+    unseen = find_unseen(views.cameras, [captured], sphere(torch.zeros(3), 3.0), rendered, [known])
     assert not bool(whole.mask[0].any())
     assert bool(unseen.mask[0, :, :4].all()) and not bool(unseen.mask[0, :, 4:].any())
 

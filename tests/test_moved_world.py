@@ -244,7 +244,7 @@ def test_what_is_unseen(dtype, far) -> None:
         shell = fit_shell(walls() + by, center=torch.zeros(3, dtype=torch.float64) + by, fallback_radius=1.0, up=UP)
         views = bank(cameras[[0, 3, 5]].to(torch.float32))
         new = dataclasses.replace(views, cameras=views.cameras.moved(torch.tensor([1.0, 0.0, 0.0])))
-        unseen = find_unseen(new, single(cameras[:2]), shell, None)
+        unseen = find_unseen(new.cameras, single(cameras[:2]), shell, None)
         alone = seen_by_nobody_else((walls() + by).to(dtype), views[[0, 1]], views[[2]], single(cameras[:2]))
         answers.append((unseen.mask, unseen.points.double() - by, alone))
     assert torch.equal(answers[0][0], answers[1][0]) and torch.equal(answers[0][2], answers[1][2])

@@ -85,12 +85,11 @@ class Frame:
         return undistort(image, mask, self.camera, self.camera_model, self.distortion)
 
     def _load(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
-        # Posed pictures are counted in stored pixels (nerfstudio ignores the EXIF tag), unless only the upright size fits.
         size = (self.camera.height, self.camera.width)
-        stored = media.image_size(self.image_path, apply_orientation=False)
-        upright = stored != size and media.image_size(self.image_path) == size
+        upright = media.fits_only_upright(self.image_path, size)
         image, alpha = media.read_image_with_alpha(self.image_path, apply_orientation=upright)
         if tuple(image.shape[1:]) != size:
+            stored = media.image_size(self.image_path, apply_orientation=False)
             raise ValueError(_wrong_size(self, "image", self.image_path, stored))
         mask = torch.ones_like(image[:1]) if alpha is None else (alpha >= 0.5).to(image)
         if self.mask_path is not None:

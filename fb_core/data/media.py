@@ -97,6 +97,12 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
     return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
 
 
+def fits_only_upright(path: str | Path, size: tuple[int, int]) -> bool:
+    """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in stored pixels, unless
+    only the upright size fits. Headers alone are read."""
+    return image_size(path, apply_orientation=False) != size and image_size(path) == size
+
+
 def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
     """Writes colours (3 channels) or grey (1 channel); the suffix chooses the format.
 
