@@ -40,7 +40,7 @@ ROOMS_TINY = Recipe(
         draws=2,  # a scene that is encoded, and whose known tokens are computed, is worth two draws of noise
         pure_noise=0.1,  # so that one step answers with the mean
         ray_weight=0.3,
-        task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False, guess=0.7),
+        task=TaskConfig(views=12, ray_task=0.15, random_heading=False, random_fill=False, guess=0.7, sector=0.5),
     ),
     engine=EngineConfig(precision="auto", draw_ahead=True),  # on two cores data are waited for in 1 % of the time instead of 16 %
 )
@@ -61,7 +61,7 @@ ROOMS_ABLATION = dataclasses.replace(
         draws=1,
         pure_noise=0.0,
         ray_weight=1.0,
-        task=dataclasses.replace(ROOMS_TINY.dit_loss.task, views=8, mixture="quarters", ray_task=0.25, guess=0.0),
+        task=dataclasses.replace(ROOMS_TINY.dit_loss.task, views=8, mixture="quarters", ray_task=0.25, guess=0.0, sector=0.0),
     ),
 )
 """A transformer of 1 M parameters between the autoencoders of rooms-tiny, for comparing designs on a CPU (``eval ablations``)."""

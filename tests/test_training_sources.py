@@ -116,6 +116,42 @@ def test_meshes_make_sequences_and_broken_files_are_named(meshes, caplog):
 # ---- captures ----
 
 
+@pytest.fixture(scope="module")
+def small_rooms():
+    pool = RoomPool(PoolConfig(families=("narrow",), rooms=2, views=8, image_size=16), seed=0)
+    pool.advance(0)
+    return pool
+
+
+def axes_of(sequences):
+    """The ray through each picture's middle [b, n, 3]."""
+    return torch.nn.functional.normalize(sequences.raymaps[:, :, 3:].mean(dim=(3, 4)), dim=-1)
+
+
+def test_a_sequence_in_sectors_knows_the_views_that_look_where_the_first_one_looks(small_rooms):
+    task = TaskConfig(views=8, partial_share=0.0, dropout=0.0, ray_task=0.0, random_heading=False, sector=1.0)
+    axes = axes_of(small_rooms.sequences(range(0, 6), task, draws()))
+    closeness = (axes * axes[:, :1]).sum(dim=-1)
+    assert (closeness[:, 1:] <= closeness[:, :-1] + 0.03).all()  # the middle of four pixels is not quite the axis
+    assert closeness[:, 1].mean() > closeness[:, -1].mean() + 0.5
+
+
+def test_sectors_change_the_order_of_the_views_and_nothing_else(small_rooms, tiny_capture):
+    capture = CaptureSource([tiny_capture], CaptureConfig(image_size=16))
+    for source in (small_rooms, capture):
+        plain, sectors = (
+            source.sequences(range(0, 1), TaskConfig(views=4, random_heading=False, sector=share), draws()) for share in (0.0, 1.0)
+        )
+        same = {tuple(image.flatten().tolist()) for image in plain.images[0]}
+        assert {tuple(image.flatten().tolist()) for image in sectors.images[0]} == same
+        assert torch.equal(plain.images[0, 0], sectors.images[0, 0])
+
+
+def test_odds_of_sectors_are_odds():
+    with pytest.raises(ValueError, match=r"from 0 to 1, got 1\.5"):
+        TaskConfig(sector=1.5)
+
+
 def test_captures_become_square_sequences_with_truth_where_their_masks_say(tiny_capture):
     source = CaptureSource(find_captures(tiny_capture.parent), CaptureConfig(image_size=16, strides=(1,)))
     assert isinstance(source, Source)

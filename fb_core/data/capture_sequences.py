@@ -19,7 +19,7 @@ from torch import Tensor
 
 from fb_core.data import media
 from fb_core.data.captures import Frame, read_capture
-from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, training_frame
+from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, task_order, training_frame
 from fb_core.data.transforms_json import JSON_NAME
 from fb_core.data.undistort import straight_camera
 from fb_core.geometry.cameras import Pinholes
@@ -112,6 +112,8 @@ class CaptureSource:
         places = torch.full((task.views, 2), 0.5) if centered else torch.rand(task.views, 2, generator=generator)
         windows = [Window.of(capture.frames[number], place.tolist(), config) for number, place in zip(chosen, places, strict=True)]
         cameras = capture.normalized(Pinholes.cat([window.camera for window in windows]))
+        order = task_order(cameras, task, generator=generator)
+        windows, cameras = [windows[number] for number in order.tolist()], cameras[order]
         frame = training_frame(cameras, task, generator=generator)
         raymaps = frame.apply(raymaps_of(cameras)).float().to(self.device)  # float32 only here: worlds may have large coordinates
         if cameras_only:

@@ -19,7 +19,7 @@ from torch import Tensor
 from fb_core.data.ray_caster import render_batch
 from fb_core.data.room_cameras import training_cameras
 from fb_core.data.rooms import FAMILIES, make_room
-from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, training_frame
+from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, task_order, training_frame
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
 
@@ -156,6 +156,7 @@ class ViewPool(ABC):
         chosen = torch.randperm(self.views, generator=generator)[: task.views]
         cameras = self._cameras[slot]
         assert cameras is not None, "advance() renders the pool before sequences are drawn"
+        chosen = chosen[task_order(cameras[chosen], task, generator=generator)]
         cameras = cameras[chosen].to(self.device)
         frame = training_frame(cameras, task, generator=generator)
         return _Framed(slot, chosen.to(self.device), cameras, frame)

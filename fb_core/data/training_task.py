@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -73,6 +73,13 @@ class TaskConfig:
     """Odds that a sequence's unknown views come with a guess (`fb_core.training.guesses`); the paper has none."""
     guess_by_depth: float = 0.5
     """Odds that a guess comes by the true distance with the errors of splats, where the source knows it, instead of by direction."""
+    sector: float = 0.0
+    """Odds that the views of a sequence stand in the order of their angle to the first one's axis (`task_order`), so that its known views
+    look one way and its unknown ones another, as in a casual capture that lacks a side; otherwise, as in the paper, in random order."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sector <= 1:
+            raise ValueError(f"training: expected odds of known views in one sector from 0 to 1, got {self.sector}")
 
 
 @runtime_checkable
@@ -114,6 +121,16 @@ def training_frame(cameras: Pinholes, task: TaskConfig, *, generator: torch.Gene
     if task.frame == "random":
         return _random_frame(cameras, fill, generator)
     return CanonicalFrame.of(cameras, heading_radians=2 * math.pi * turn if task.random_heading else 0.0, fill=fill)
+
+
+def task_order(cameras: Pinholes, task: TaskConfig, *, generator: torch.Generator) -> Int[Tensor, "n"]:
+    """The order in which views that are in random order stand in a sequence: as they are, or by their angles (``task.sector``)."""
+    if not task.sector or float(torch.rand((), generator=generator)) >= task.sector:
+        return torch.arange(len(cameras))
+    axes = cameras.rotations[:, :, 2].cpu()
+    closeness = axes @ axes[0]
+    closeness[0] = torch.inf  # the first view stays the reference, whatever rounding says
+    return closeness.argsort(descending=True, stable=True)
 
 
 def _random_frame(cameras: Pinholes, fill: float, generator: torch.Generator) -> CanonicalFrame:
