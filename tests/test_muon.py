@@ -48,6 +48,19 @@ def test_matrices_of_one_shape_together_equal_each_by_itself():
     torch.testing.assert_close(orthogonalised(matrices), torch.cat([orthogonalised(matrix[None]) for matrix in matrices]))
 
 
+@pytest.mark.parametrize("shape", [(2, 96, 8), (2, 8, 96), (1, 256, 32)])
+def test_long_matrices_in_bfloat16_go_by_their_small_side_and_closer_to_the_exact_answer(shape):
+    matrices = random(*shape)
+    exact = orthogonalised(matrices.double(), torch.float64)
+    short = matrices[..., : 5 * min(shape[1:])] if shape[1] < shape[2] else matrices[:, : 5 * min(shape[1:])]
+    plain = orthogonalised(short, torch.bfloat16) - orthogonalised(short.double(), torch.float64)  # not long enough for the small side
+    got = orthogonalised(matrices, torch.bfloat16)
+    assert got.dtype == torch.float32
+    assert (got - exact).square().mean().sqrt() < plain.square().mean().sqrt()
+    torch.testing.assert_close(got.mT, orthogonalised(matrices.mT, torch.bfloat16))
+    assert (orthogonalised(torch.zeros(1, 96, 8), torch.bfloat16) == 0).all()
+
+
 def test_a_step_has_the_size_that_adamw_takes():
     weight = nn.Parameter(torch.zeros(64, 16))
     weight.grad = random(64, 16)

@@ -2,6 +2,9 @@
 
 import torch
 
+from fb_core.conditioning import encode_frozen, encode_in_chunks
+from fb_core.evaluation.completion import unseen_room
+from fb_core.inpainter import Fillerbuster
 from fb_core.networks import precision
 from fb_core.training.muon import Muon, orthogonalised
 
@@ -39,3 +42,12 @@ def test_muon_steps_along_kernels_as_along_their_matrices():
         for optimizer in optimizers:
             optimizer.step()
     torch.testing.assert_close(kernel.detach().flatten(1), matrix.detach())
+
+
+def test_a_frozen_autoencoder_in_bfloat16_tells_the_same_up_to_its_rounding():
+    vae = Fillerbuster.from_pretrained().image_vae
+    images = unseen_room(family="narrow", seed=0, number=0, views=3, size=32).images
+    exact, rough = (encode_frozen(vae, images, 2, kind) for kind in (torch.float32, torch.bfloat16))
+    assert rough.dtype == torch.float32
+    assert torch.equal(exact, encode_in_chunks(vae, images, 2))
+    assert float((rough - exact).norm() / exact.norm()) < 0.03

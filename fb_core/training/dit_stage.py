@@ -13,7 +13,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import Conditioning, assemble, encode_in_chunks, frames_for, join, only_known, split, unsplit, with_guess
+from fb_core.conditioning import Conditioning, assemble, encode_frozen, frames_for, join, only_known, split, unsplit, with_guess
 from fb_core.data.training_task import Sequences, Source, TaskConfig
 from fb_core.flow import at_time, logit_normal_times, masked_loss, velocity
 from fb_core.geometry.raymap import to_unit_range
@@ -123,8 +123,10 @@ class DiTStage(Stage):
         seed: int,
         encode_text: EncodeText | None = None,
         shared: SharedBatches | None = None,
+        encoding: torch.dtype = torch.float32,
     ):
-        """``shared`` is for trainings side by side that differ in nothing but the network, the task, and the losses' weights.
+        """``shared`` is for trainings side by side that differ in nothing but the network, the task, and the losses' weights; the
+        autoencoders compute in the precision ``encoding``.
 
         Raises ValueError for a network that reads text without ``encode_text`` (``TextEncoder.encode``).
         """
@@ -137,7 +139,7 @@ class DiTStage(Stage):
         self.image_vae, self.raymap_vae = (vae.eval().requires_grad_(False) for vae in (image_vae, raymap_vae))
         self.pool, self.config, self.seed = pool, config, seed
         self._encode_text = encode_text if network.config.text_width else None
-        self._shared = shared
+        self._shared, self._encoding = shared, encoding
         self._empty_prompt: Tensor | None = None
 
     @property
@@ -196,7 +198,7 @@ class DiTStage(Stage):
         """Their latents, with the guesses of this step."""
         guess = guesses_of(sequences, rows, self.config.task, partial(row_generator, self.seed, step, stream=_GUESSES))
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
-        data, conditioning = encode_sequences(sequences, **vaes, guess=guess, transformer=self.network.config)
+        data, conditioning = encode_sequences(sequences, **vaes, guess=guess, transformer=self.network.config, precision=self._encoding)
         image_weight, rays_weight = (_latent_weight(truth) for truth in (sequences.image_truth, sequences.rays_truth))
         return Encoded(data, conditioning, image_weight, rays_weight, sequences.captions)
 
@@ -229,13 +231,19 @@ def _latent_weight(truth: Float[Tensor, "b n 1 h w"] | None) -> Float[Tensor, "b
 
 @torch.no_grad()
 def encode_sequences(
-    sequences: Sequences, *, image_vae: VAE, raymap_vae: VAE, guess: Guess | None = None, transformer: DiTConfig | None = None
+    sequences: Sequences,
+    *,
+    image_vae: VAE,
+    raymap_vae: VAE,
+    guess: Guess | None = None,
+    transformer: DiTConfig | None = None,
+    precision: torch.dtype = torch.float32,
 ) -> tuple[Tensor, Conditioning]:
     """(clean latents [b, n, 32, h, w], conditioning) of a batch.
 
     Latents that the pool kept are used. A view that is wholly known conditions with its clean latent, and all wholly unknown ones
     share one latent, so that only partly known and guessed views are encoded twice. Ray frames come along for a ``transformer`` that
-    attends in them.
+    attends in them. The autoencoders compute in ``precision``.
     """
     batch = sequences.images.shape[0]
     parts = []
@@ -244,8 +252,8 @@ def encode_sequences(
         (raymap_vae, to_unit_range(sequences.raymaps), sequences.rays_known, None, None),
     ):
         values, known = values.flatten(0, 1), known.flatten(0, 1)
-        clean = encode_in_chunks(vae, values, 256) if kept is None else kept.flatten(0, 1)
-        nothing = encode_in_chunks(vae, torch.zeros_like(values[:1]), 1)
+        clean = encode_frozen(vae, values, 256, precision) if kept is None else kept.flatten(0, 1)
+        nothing = encode_frozen(vae, torch.zeros_like(values[:1]), 1, precision)
         told = only_known(values, known)
         if guessed is not None:
             told, known = with_guess(told, known, guessed.images.flatten(0, 1), guessed.belief.flatten(0, 1))
@@ -253,7 +261,7 @@ def encode_sequences(
         masked = torch.where((share > 0)[:, None, None, None], clean, nothing)
         partial = (share > 0) & (share < 1)
         if bool(partial.any()):
-            masked[partial] = encode_in_chunks(vae, told[partial], 256)
+            masked[partial] = encode_frozen(vae, told[partial], 256, precision)
         parts.append([rearrange(x, "(b n) c h w -> b n c h w", b=batch) for x in (clean, masked, to_latent_grid(known))])
     (image, image_masked, image_known), (rays, rays_masked, rays_known) = parts
     frames = frames_for(transformer, sequences.raymaps, sequences.rays_known)

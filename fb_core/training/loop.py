@@ -114,8 +114,8 @@ class EngineConfig:
     """How the machine does it; but for rounding, none of this changes what is learned."""
 
     precision: Precision = "float32"
-    """Of matrix products and convolutions (autocast) and of Muon's iteration; weights, their average, norms and losses stay in float32.
-    'auto' is bfloat16 where the device is faster at it."""
+    """Of matrix products and convolutions (autocast), of the frozen autoencoders' too, and of Muon's iteration; weights, their average,
+    norms and losses stay in float32. 'auto' is bfloat16 where the device is faster at it."""
     accumulate: int = 1
     """Parts that a process does its rows of a batch in, one after the other."""
     recompute: bool = False

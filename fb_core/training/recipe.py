@@ -14,12 +14,13 @@ import torch
 from torch import nn
 
 from fb_core import checkpoint
-from fb_core.conditioning import encode_in_chunks
+from fb_core.conditioning import encode_frozen
 from fb_core.data.sequences import PoolConfig
 from fb_core.data.training_data import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
 from fb_core.data.training_task import Source
 from fb_core.files.whole import whole_file
 from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.precision import resolved
 from fb_core.networks.text import WORDS, TextEncoder
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import Network
@@ -152,16 +153,18 @@ def dit_stage(
         seed=recipe.seed,
         encode_text=encode_text,
         shared=shared,
+        encoding=resolved(recipe.engine.precision, device),
     )
 
 
 def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "cpu") -> Source:
     """The transformer's data: at one size, and from some step on at one of several in each step."""
+    precision = resolved(recipe.engine.precision, device)
     shared: dict[str, Any] = {
         "seed": recipe.seed + 1,
         "device": device,
         "single_share": recipe.single_view_share,
-        "encode": lambda images: encode_in_chunks(image_vae, images, 64),
+        "encode": lambda images: encode_frozen(image_vae, images, 64, precision),
     }
     source = training_source(recipe.data, recipe.pool, per_row=recipe.dit_loss.images_per_row, **shared)
     if not recipe.resolutions:
