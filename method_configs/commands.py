@@ -22,6 +22,7 @@ from method_configs.bench_fit import Fit
 from method_configs.bench_poses import Poses
 from method_configs.bench_sampler import Sampler
 from method_configs.bench_splat import Splat
+from method_configs.builds_benchmark import Builds
 from method_configs.conditioning_evaluation import Conditioning
 from method_configs.consistency_evaluation import Consistency
 from method_configs.design_evaluation import Designs
@@ -290,6 +291,7 @@ def bench(
         | Annotated[Methods, tyro.conf.subcommand("methods")]
         | Annotated[Inference, tyro.conf.subcommand("inference")]
         | Annotated[Paper, tyro.conf.subcommand("paper")]
+        | Annotated[Builds, tyro.conf.subcommand("builds")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
