@@ -36,6 +36,8 @@ class Builds(TableFiles):
     """Known + unknown views."""
     rooms: int = 10
     """Unseen rooms."""
+    training_steps: int = 0
+    """Also so many training steps of the preset rooms-tiny in the paper's design, which every build knows."""
     threads: int = 1
     """Threads of each build."""
 
@@ -56,6 +58,8 @@ class Builds(TableFiles):
         ):
             for known, unknown in cases:
                 report.rows.extend(self._rows(Path(folder), (this, other), known, unknown))
+            if self.training_steps:
+                report.rows.extend(self._training_rows(this, other))
         self.publish(report, draw)
 
     def _rows(self, folder: Path, builds: tuple[_Build, ...], known: int, unknown: int) -> list[dict[str, Any]]:
@@ -67,6 +71,21 @@ class Builds(TableFiles):
             for build in builds:
                 found[build.name].append(build.complete(stored, truth, known, seed=self.seed + number))
         return [self._row(build, found, builds[-1].name, f"{known}+{unknown}") for build in builds]
+
+    def _training_rows(self, this: _Build, other: _Build) -> list[dict[str, Any]]:
+        """Both builds' training steps; the loss is a running mean over all of them."""
+        _logger.info("%d training steps", self.training_steps)
+        found = [(this.trained(), other.trained()) for _ in range(self.training_steps)]
+        return [
+            {
+                "part": "a training step", "build": f"{build.name} ({_commit_of(build.root)})", "steps": self.training_steps,
+                "cpu_seconds": median(pair[number]["cpu_seconds"] for pair in found),
+                "seconds": median(pair[number]["seconds"] for pair in found),
+                "times_as_fast": median(pair[1]["cpu_seconds"] / pair[number]["cpu_seconds"] for pair in found),
+                "loss": found[-1][number]["loss"],
+            }
+            for number, build in enumerate((this, other))
+        ]  # fmt: skip
 
     def _row(self, build: _Build, found: dict[str, list[dict[str, float]]], against: str, case: str) -> dict[str, Any]:
         """One build's figures for one case, with its gain over the other one, room by room."""
@@ -109,11 +128,17 @@ class _Build:
         from fb_core.evaluation.image_metrics import psnr
 
         answer = stored.with_suffix(".answer.npy")
-        asked = {"views": str(stored), "known": known, "seed": seed, "answer": str(answer)}
-        assert self._process.stdin is not None
-        print(json.dumps(asked), file=self._process.stdin, flush=True)
-        took = self._answer()
+        took = self._asked({"views": str(stored), "known": known, "seed": seed, "answer": str(answer)})
         return took | {"psnr": float(psnr(torch.from_numpy(np.load(answer)), truth).mean())}
+
+    def trained(self) -> dict[str, Any]:
+        """Seconds, CPU seconds and loss of a further training step."""
+        return self._asked({})
+
+    def _asked(self, question: dict[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        print(json.dumps(question), file=self._process.stdin, flush=True)
+        return self._answer()
 
     def _answer(self) -> dict[str, Any]:
         assert self._process.stdout is not None
@@ -161,8 +186,8 @@ def draw(report: Report, path: Path) -> None:
 
     figure = Figure(figsize=(5, 4), layout="constrained")
     axes = figure.subplots()
-    for case in dict.fromkeys(row["case"] for row in report.rows):
-        rows = [row for row in report.rows if row["case"] == case]
+    for case in dict.fromkeys(row["case"] for row in report.rows if "case" in row):
+        rows = [row for row in report.rows if row.get("case") == case]
         axes.plot([row["cpu_seconds"] for row in rows], [row["psnr"] for row in rows], marker="o", label=f"{case} views")
         for row in rows:
             axes.annotate(row["build"], (row["cpu_seconds"], row["psnr"]), fontsize=7)
