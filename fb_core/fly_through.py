@@ -162,10 +162,12 @@ def generate(
 ) -> Float[Tensor, "n 3 s s"]:
     """Views at the path's cameras, pass by pass, conditioned on the photos' central squares (and on views of the first pass).
 
+    The model is told of all cameras near their middle, so that a world far from its origin gives the same views.
+
     Args:
         photos: what is known.
         cameras: of the whole photos.
-        path: square cameras; their size is that of the views.
+        path: square cameras; their size is that of the views. In float64 where the world is far from its origin.
         passes: see `plan_passes`; pass ``k`` draws from ``seed + k``.
         model: the diffusion model.
         seed: the same seed and the same input give the same views.
@@ -175,7 +177,9 @@ def generate(
     """
     side = path.width
     squares = [Square.of(photo, side) for photo in photos]
-    inside = Pinholes.cat([square.inside(camera) for square, camera in zip(squares, cameras, strict=True)]).to(torch.float32)
+    inside = Pinholes.cat([square.inside(camera) for square, camera in zip(squares, cameras, strict=True)]).to(torch.float64)
+    middle = inside.centers.mean(dim=0)
+    inside, path = (some.to(torch.float64).moved(-middle.to(some.centers.device)).to(torch.float32) for some in (inside, path))
     images, masks = (torch.stack([getattr(square, name) for square in squares]) for name in ("image", "known"))
     given = Views.known(images, inside, mask=masks)
     made = torch.zeros(len(path), 3, side, side)

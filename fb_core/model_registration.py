@@ -89,7 +89,8 @@ class RaymapCameras:
     residuals_degrees: list[float]
     """Standard deviation of directions about the camera's; NaN where there is none."""
     raymaps: Float[Tensor, "n 6 s s"]
-    """As denoised; those of known cameras are exact. NaN where nothing was denoised."""
+    """As denoised; those of known cameras are exact. NaN where nothing was denoised. Float64 where cameras were given: their world may be
+    far from its origin."""
     origin_deviations: list[float]
     """Standard deviation of the mean of a photo's origins, in the raymaps' unit."""
 
@@ -107,8 +108,35 @@ def recover_with_model(
 
     At most `views_at_once` photos are denoised together. With more of them, the first window holds those that cover the scene best; the
     others follow, each window beside some photos that have a camera by then, whose rays are given. Where photos come with cameras,
-    these are given from the start, and the frame is theirs.
+    these are given from the start, and the frame is theirs; all work is done near the first of them, so that a moved world loses nothing.
     """
+    options = {"seed": seed, "sampling": sampling, "views_at_once": views_at_once, "on_progress": on_progress}
+    given = [photo.camera for photo in photos if photo.camera is not None]
+    if not given:
+        return _recovered_near(photos, model, **options)
+    origin = given[0].centers[0].double()
+    near = [dataclasses.replace(photo, camera=_moved(photo.camera, -origin)) for photo in photos]
+    found = _recovered_near(near, model, **options)
+    back = [_moved(camera, origin) for camera in found.cameras]
+    cameras = [camera if photo.camera is None else photo.camera for photo, camera in zip(photos, back, strict=True)]
+    raymaps = found.raymaps.double() + torch.cat([origin, torch.zeros_like(origin)])[:, None, None]
+    return dataclasses.replace(found, cameras=cameras, raymaps=raymaps)
+
+
+def _moved(camera: Pinholes | None, shift: Float[Tensor, " 3"]) -> Pinholes | None:
+    return None if camera is None else camera.to(torch.float64).moved(shift)
+
+
+def _recovered_near(
+    photos: Sequence[Photo],
+    model: Fillerbuster,
+    *,
+    seed: int,
+    sampling: SamplingConfig,
+    views_at_once: int,
+    on_progress: Callable[[str, int, int], None],
+) -> RaymapCameras:
+    """As :func:`recover_with_model`, for cameras that are given near the origin."""
     squares = [Square.of(photo, model.size) for photo in photos]
     raymaps = torch.full((len(photos), 6, model.size, model.size), torch.nan)
     given = [index for index, photo in enumerate(photos) if photo.camera is not None]

@@ -107,6 +107,8 @@ def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
     arrangement = Arrangement.NO_CAMERA
     if placed:
         centers = torch.cat([camera.centers for camera, _ in placed])
+        given = [photo.camera.centers[0] for photo in photos if photo.camera is not None]
+        centers = centers - given[0].to(centers) if given else centers  # rounding is that of the place that raymaps were denoised at
         deviations = centers.new_tensor([off for _, off in placed])
         arrangement = arrangement_of(centers, deviations, precision=torch.finfo(torch.float32).eps)
     return Registration(

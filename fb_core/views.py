@@ -58,9 +58,13 @@ class Views:
 
     @staticmethod
     def known(images: Float[Tensor, "n 3 h w"], cameras: Pinholes, *, mask: Float[Tensor, "n 1 h w"] | None = None) -> Views:
-        """Captured views with known cameras; ``mask`` marks the known pixels (default: all)."""
-        ones = torch.ones_like(images[:, :1])
-        return Views(images=images, image_known=ones if mask is None else mask, raymaps=raymaps_of(cameras).to(images), rays_known=ones)
+        """Captured views with known cameras; ``mask`` marks the known pixels (default: all).
+
+        Rays keep the cameras' precision where that is the higher one: single precision knows no millimetre far from the origin.
+        """
+        ones, rays = torch.ones_like(images[:, :1]), raymaps_of(cameras)
+        rays = rays.to(images.device, torch.promote_types(images.dtype, rays.dtype))
+        return Views(images=images, image_known=ones if mask is None else mask, raymaps=rays, rays_known=ones)
 
     @staticmethod
     def unknown(cameras: Pinholes) -> Views:

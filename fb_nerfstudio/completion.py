@@ -175,10 +175,15 @@ def round_images(
         **optional,
     )
     new = filled[list(range(len(sequence) - views, len(sequence)))]
-    images = (new.images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
+    images = in_8_bits(new.images)
     if cache is not None:
         cache.keep(key, images)
     return images
+
+
+def in_8_bits(images: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w 3"]:
+    """Pictures as the bank and the cache hold them."""
+    return (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
 
 
 def fitted_view(view: CapturedView, size: int) -> Views:

@@ -25,7 +25,7 @@ from fb_nerfstudio.bank import Bank, without_requested
 from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
 from fb_nerfstudio.captured_views import CapturedViewsDatamanager
 from fb_nerfstudio.completed_views import CompletedViews, round_title, views_target
-from fb_nerfstudio.completion import Inpainter, announcement, run_completion
+from fb_nerfstudio.completion import Inpainter, announcement, open_cache, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
@@ -235,9 +235,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             left = len(plan.rounds) - (0 if done is None else len(done.rounds))
             with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
                 if config.trust == "measured" and not inpaints and self._trust is None:
-                    trust = measured_trust([*context], model, config, size=size, on_step=bars.trial)
+                    trust = measured_trust([*context], model, config, size=size, cache=open_cache(config), on_step=bars.trial)
                     self._trust = trust.value
                     CONSOLE.print(trust.in_words)
+                    if trust.hidden:  # a kill in the first round costs that round, not the trial too
+                        save_checkpoint(trainer, step)
                 for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
                     left -= 1
                     self._set_bank(merged(self.generated_views, (), views.believed(self._trust)))

@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.views import Views
-from fb_nerfstudio.completion import CapturedView, Inpainter, fitted_view
+from fb_nerfstudio.completion import CapturedView, Inpainter, fitted_view, in_8_bits
+from fb_nerfstudio.completion_cache import CompletionCache, round_key
 from fb_nerfstudio.completion_config import CompletionConfig
 
 LEAST = 0.05
@@ -65,6 +66,7 @@ def measured_trust(
     config: CompletionConfig,
     *,
     size: int,
+    cache: CompletionCache | None = None,
     on_step: Callable[[int, int], None] | None = None,
 ) -> Trust:
     """Hide a quarter of the context views (at most 4, never the first, which is the frame's), generate them from the others, compare.
@@ -74,6 +76,7 @@ def measured_trust(
         model: the diffusion model.
         config: how to sample, and the seed.
         size: side of the views in pixels.
+        cache: of generated rounds; what was ever generated from the same inputs is taken from there, else kept there.
         on_step: called with (denoising steps done, steps in all).
     """
     count = min(_MOST_HIDDEN, len(context) // _FEWEST)
@@ -83,21 +86,44 @@ def measured_trust(
     hidden = Views.cat([fitted_view(context[place], size) for place in places])
     told = Views.cat([fitted_view(view, size) for place, view in enumerate(context) if place not in set(places)])
     asked = dataclasses.replace(hidden, images=torch.zeros_like(hidden.images), image_known=torch.zeros_like(hidden.image_known))
-    sampling = dataclasses.replace(config.sampling(model.recommended_sampling), guess="start")
-    done = model.complete(
-        Views.cat([told, asked]), generator=torch.Generator().manual_seed((config.seed + _SEED) % 2**63), sampling=sampling, on_step=on_step
-    )
-    generated = done.images[len(told) :].to(hidden.images)
+    generated = _as_kept(_generated(Views.cat([told, asked]), count, model, config, cache, on_step)).to(hidden.images)
+    truth = _as_kept(in_8_bits(hidden.images)).to(hidden.images)
     known = (hidden.image_known >= 1).to(hidden.images)
     mean = (told.images * told.image_known).sum(dim=(0, 2, 3)) / told.image_known.sum().clamp(min=1)
     looks = [context[place].camera for place in range(len(context)) if place not in set(places)]
     nearest = told.images[[_nearest(context[place].camera, looks) for place in places]]
     return Trust(
         hidden=count,
-        model=_error(generated, hidden.images, known),
-        mean=_error(mean[None, :, None, None].expand_as(generated), hidden.images, known),
-        nearest=_error(nearest, hidden.images, known),
+        model=_error(generated, truth, known),
+        mean=_error(mean[None, :, None, None].expand_as(generated), truth, known),
+        nearest=_error(nearest, truth, known),
     )
+
+
+def _generated(
+    sequence: Views,
+    count: int,
+    model: Inpainter,
+    config: CompletionConfig,
+    cache: CompletionCache | None,
+    on_step: Callable[[int, int], None] | None,
+) -> UInt8[Tensor, "n h w 3"]:
+    """The last views of the sequence, in 8 bits: a picture from the cache and one that is new are the same."""
+    sampling = dataclasses.replace(config.sampling(model.recommended_sampling), guess="start")
+    seed, key, found = (config.seed + _SEED) % 2**63, "", None
+    if cache is not None:
+        key = round_key(sequence, seed=seed, sampling=sampling, model_hash=model.model_hash)
+        found = cache.find(key, views=count, size=sequence.size[0])
+    if found is None:
+        done = model.complete(sequence, generator=torch.Generator().manual_seed(seed), sampling=sampling, on_step=on_step)
+        found = in_8_bits(done.images[-count:])
+        if cache is not None:
+            cache.keep(key, found)
+    return found
+
+
+def _as_kept(pictures: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:
+    return pictures.permute(0, 3, 1, 2).float() / 255
 
 
 def _error(pictures: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"], known: Float[Tensor, "n 1 h w"]) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
 if TYPE_CHECKING:
@@ -175,6 +176,6 @@ def _save(figure: Any, path: Path) -> None:
     from matplotlib import pyplot
 
     with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=150)
+        figure.savefig(unfinished, dpi=150, metadata=signature(path))
     pyplot.close(figure)
     _logger.info("wrote %s", path)

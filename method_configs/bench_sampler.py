@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def draw(report: Report, path: Path) -> None:
         axes.set_xlabel("passes of the network")
     panels[0][0].legend(fontsize=7)
     with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=130)
+        figure.savefig(unfinished, dpi=130, metadata=signature(path))
     pyplot.close(figure)
     _logger.info("wrote %s", path)
 

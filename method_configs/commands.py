@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import tyro
 
 from fb_core.files.faults import sentence_of
+from fb_core.files.ownership import require_own_or_new
 from fb_core.interruption import ENDED_BY_USER, stop_on_signals
 from method_configs.ablation_evaluation import Ablations
 from method_configs.bench_command import Networks, Precision
@@ -295,6 +296,7 @@ def bench(
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
+    _require_free_places(benchmark)
     benchmark.run()
 
 
@@ -313,7 +315,16 @@ def evaluate(
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""
+    _require_free_places(evaluation)
     evaluation.run()
+
+
+def _require_free_places(command: object) -> None:
+    """Raises ValueError, before hours of measuring, where a result would take the place of a file that is none."""
+    for name in ("json", "csv", "markdown", "figure", "sheet"):
+        path = getattr(command, name, None)
+        if isinstance(path, Path):
+            require_own_or_new(path)
 
 
 def check(*, mend: bool = False) -> None:

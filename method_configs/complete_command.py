@@ -64,6 +64,8 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     clock = _Clock()
     with clock.stage("reading"):
         job = _read(source, options)
+    target = _with_pictures(target, job.photos)
+    target.check()
     with clock.stage("loading the model"):
         model = _load_model(options, needed=not options.poses_only or (options.cameras != "features" and not job.all_known))
     found, new, told = _work(job, options, model, clock)
@@ -109,6 +111,12 @@ def _target(source: Path, output: Path, options: CompleteOptions, overwrite: boo
     given = [source, options.known_poses, options.model, options.text_encoder, *path]
     inputs = tuple(one for one in given if one is not None)
     return Target(folder=output, kind=KIND, overwrite=overwrite, inputs=inputs, earlier=is_ours)
+
+
+def _with_pictures(target: Target, photos: list[Photo]) -> Target:
+    """The target, which spares also pictures that lie elsewhere through links; one of each folder stands for all in it."""
+    one_of_each = {path.parent: path for path in (photo.source.resolve() for photo in photos)}
+    return dataclasses.replace(target, inputs=(*target.inputs, *one_of_each.values()))
 
 
 def _read(source: Path, options: CompleteOptions) -> Job:
@@ -211,7 +219,7 @@ def _work(
         images = generate(
             [job.photos[index] for index in context],
             [found.camera(index) for index in context],
-            path.to(torch.float32),
+            path,
             plan.passes,
             model,
             seed=options.seed,

@@ -51,6 +51,7 @@ def export_run(
 
 
 def _read(run: Path, capture: Capture) -> tuple[Path, ...]:
-    """All that an export reads: the run's options and checkpoints, and the capture with folders of pictures elsewhere."""
-    elsewhere = {frame.image_path.resolve().parent for frame in capture.frames}
+    """All that an export reads: the run's options and checkpoints, and the capture with folders of its files elsewhere."""
+    files = [path for frame in capture.frames for path in (frame.image_path, frame.mask_path)]
+    elsewhere = {path.resolve().parent for path in (*files, capture.points_path) if path is not None}
     return (run / "config.yml", run / "nerfstudio_models", capture.root, *sorted(elsewhere))

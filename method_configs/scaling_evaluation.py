@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
 if TYPE_CHECKING:
@@ -73,6 +74,6 @@ def draw(report: Report, path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("PSNR of the hidden views (dB)")
     with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=150)
+        figure.savefig(unfinished, dpi=150, metadata=signature(path))
     pyplot.close(figure)
     _logger.info("wrote %s", path)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fb_core.evaluation.contact_sheet import Strip, evenly, write_contact_sheet
 from fb_core.evaluation.image_metrics import psnr
+from fb_core.files.ownership import require_own_or_new
 from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio
 from fb_nerfstudio.completed_views import CompletedViews
 from method_configs.finished_run import load_run, quiet
@@ -31,8 +32,9 @@ def write_sheet(run: Path, output: Path, *, before: Path | None = None) -> None:
         output: the picture's file; missing folders are made.
         before: folder of another run on the same capture, whose render at each of these cameras is drawn too.
 
-    Raises ValueError when there is no finished run in the folder.
+    Raises ValueError when there is no finished run in the folder, and when ``output`` is a file that is no earlier picture of ours.
     """
+    require_own_or_new(output)
     pipeline = load_run(run)
     manager: Any = pipeline.datamanager
     bank: CompletedViews | None = manager.generated_views

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from fb_core.checkpoint import model_target, require_model_or_free
+from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
 from fb_core.data.training_data import TrainingData
 from fb_core.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.training.checkpoints import read_state
@@ -78,7 +78,7 @@ def train_preset(
     changes = {name: value for name, value in chosen.items() if value is not None} | {name: True for name, value in flags.items() if value}
     engine = dataclasses.replace(recipe.engine, **changes)
     if not dry_run:
-        require_model_or_free(model_target(output / "model", overwrite=True))  # before days of training, not after them
+        _require_own_model_or_free(output, start_from)  # before days of training, not after them
     with joined(_device(device)) as (group, where):
         if dry_run:
             for name in stages:
@@ -125,6 +125,15 @@ def _train_stages(
             _say(group, "%s stopped at step %d of %d; the same command goes on from there", name, run.step, run.config.steps)
             break
     return all(_steps_done(output / name) for name in STAGES)
+
+
+def _require_own_model_or_free(output: Path, start_from: Path | None) -> None:
+    """Raises ValueError where the training's model would replace one that it has not made itself, or the one that it begins with."""
+    target = model_target(output / "model", overwrite=True, inputs=() if start_from is None else (start_from / CONFIG_FILE,))
+    require_model_or_free(target)
+    begun = any((output / stage / "checkpoint.pt").exists() for stage in STAGES)
+    if not begun and target.folder.is_dir() and any(target.folder.iterdir()):
+        raise ValueError(f"output {output}: there is a model, but no training that made it; choose another folder, or move the model away")
 
 
 def _recipe(preset: str) -> Recipe:

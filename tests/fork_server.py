@@ -169,6 +169,7 @@ def _become(job: dict[str, Any], writer: int) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.chdir(job["watch"])
+    _renew_threads()
     changes, main = 0, threading.get_ident()
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
@@ -183,6 +184,14 @@ def _become(job: dict[str, Any], writer: int) -> None:
 
     sys.addaudithook(hook)
     atexit.register(lambda: os.write(writer, str(changes).encode()))
+
+
+def _renew_threads() -> None:
+    """torch makes its pool of threads anew at its first use after a fork, and two threads that come first at once meet none ("pool
+    INTERNAL ASSERT FAILED"). A process that has just begun has no such moment."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def _is_change(event: str, arguments: tuple[Any, ...], folder: str) -> bool:

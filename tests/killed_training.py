@@ -45,13 +45,13 @@ def at_call(number: int, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inside_the_second_round() -> None:
-    """After the first of its denoising steps."""
-    complete, rounds = Fillerbuster.complete, 0
+    """After the first of its denoising steps; before it come the trial on hidden views and the first round."""
+    complete, passes = Fillerbuster.complete, 0
 
     def dying(self: Fillerbuster, views: Any, **options: Any) -> Any:
-        nonlocal rounds
-        rounds += 1
-        if rounds == 2:
+        nonlocal passes
+        passes += 1
+        if passes == 3:
             options["on_step"] = at_call(1, lambda *_: None)
         return complete(self, views, **options)
 
@@ -65,7 +65,7 @@ def while_a_checkpoint_is_written() -> None:
     def dying(source: Any, target: Any) -> None:
         if str(target).endswith(".ckpt"):
             checkpoints.append(target)
-            if len(checkpoints) == 2:
+            if len(checkpoints) == 3:  # the first is that of the trial on hidden views
                 os.truncate(source, 1000)
                 os.kill(os.getpid(), signal.SIGKILL)
         replace(source, target)

@@ -231,9 +231,11 @@ def run_folder(folder: Path, timestamp: str = "run") -> Path:
     return folder / "out" / "room" / "fillerbuster" / timestamp
 
 
-def bank_rounds(checkpoint: Path) -> int:
-    views = torch.load(checkpoint, weights_only=True)["pipeline"]["datamanager._extra_state"]["views"]
-    return 0 if views is None else len({origin["round"] for origin in views["origins"]})
+def kept_passes(checkpoint: Path) -> int:
+    """Rounds of views, and the trial on hidden views."""
+    state = torch.load(checkpoint, weights_only=True)["pipeline"]["datamanager._extra_state"]
+    views = state["views"]
+    return (state["trust"] is not None) + (0 if views is None else len({origin["round"] for origin in views["origins"]}))
 
 
 def checkpoints(run: Path) -> list[Path]:
@@ -269,12 +271,15 @@ def tensors(state: Any) -> str:
 
 
 def test_ns_train(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
-    """Before, during and after the generation, and while checkpoints are written; it goes on with --load-dir."""
+    """Before, during and after the generation, and while checkpoints are written; it goes on with --load-dir.
+
+    Each pass of the model counts: the trial on hidden views, and every round.
+    """
     first = ns_train(inputs, Path("."))
 
     def left(folder: Path, ended: Ended) -> None:
-        known = max((bank_rounds(path) for path in checkpoints(run_folder(folder))), default=0)
-        assert ended.said.count(GENERATED) - known <= 1, f"{ended.said.count(GENERATED)} rounds generated, {known} kept"
+        known = max((kept_passes(path) for path in checkpoints(run_folder(folder))), default=0)
+        assert ended.said.count(GENERATED) - known <= 1, f"{ended.said.count(GENERATED)} passes generated, {known} kept"
         if (views := run_folder(folder) / "completion").exists():
             validate_capture(views, decode=True)
 
@@ -290,7 +295,7 @@ def test_ns_train(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path)
 
 
 def test_completion_cache(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
-    """A run that begins anew finds every round that was kept, and makes the same views."""
+    """A run that begins anew finds every round that was kept, and the trial on hidden views, and makes the same views."""
     first = ns_train(inputs, Path("."), cache="cache")
 
     def kept(folder: Path) -> list[Path]:

@@ -108,7 +108,7 @@ def test_only_the_same_kind_with_a_mark_of_ours_is_replaced(tmp_path: Path):
         Target(folder=marked(tmp_path / "room", "capture"), kind="export", overwrite=True).check()
     Target(folder=marked(tmp_path / "ours", "export"), kind="export", overwrite=True).check()
     odd = marked(tmp_path / "odd", "export")
-    (odd / MARK_NAME).write_text('{"made_by": "fillerbuster", "kind": "export", "files": [["note.txt"], {}, 3]}')
+    (odd / MARK_NAME).write_text('{"made_by": "fillerbuster", "kind": "export", "format": 1, "files": [["note.txt"], {}, 3]}')
     assert foreign_files(odd) == ["note.txt"]  # names that are none name nothing
     (tmp_path / "copied mark").mkdir()
     (tmp_path / "copied mark" / MARK_NAME).symlink_to(tmp_path / "ours" / MARK_NAME)

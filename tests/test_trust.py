@@ -13,6 +13,7 @@ from fb_core.views import Views
 from fb_nerfstudio.bank import Bank
 from fb_nerfstudio.completed_views import CompletedViews, Origin
 from fb_nerfstudio.completion import CapturedView, fitted_view
+from fb_nerfstudio.completion_cache import CompletionCache
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.trust import LEAST, Trust, measured_trust
 
@@ -122,3 +123,14 @@ def test_trust_survives_a_checkpoint_and_the_run_s_folder(tmp_path) -> None:
     assert {frame.extra["trust"] for frame in capture.frames} == {0.25}
     with pytest.raises(ValueError, match="expected a trust from 0 to 1"):
         views.believed(1.5)
+
+
+def test_with_a_cache_the_model_is_tried_once_and_means_the_same(tmp_path) -> None:
+    """A run that begins anew after a kill does not generate the hidden views a second time."""
+    context, cache = photos(), CompletionCache(tmp_path / "cache")
+    model = Knows(context, 0.1)
+    fresh = measured_trust(context, Knows(context, 0.1), CONFIG, size=16)
+    first, again = (measured_trust(context, model, CONFIG, size=16, cache=cache) for _ in range(2))
+    assert fresh == first == again and len(model.asked) == 1
+    measured_trust(context, model, dataclasses.replace(CONFIG, seed=1), size=16, cache=cache)
+    assert len(model.asked) == 2, "another seed is another trial"

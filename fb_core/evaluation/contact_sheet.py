@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
 _CELL_INCHES = 1.45
@@ -76,7 +77,7 @@ def write_contact_sheet(path: Path, strips: Sequence[Strip], *, title: str, subt
             _draw_strip(figure, strip, columns, top)
             top -= _strip_inches(strip, columns)
         with whole_file(path) as unfinished:
-            figure.savefig(unfinished, format="png")
+            figure.savefig(unfinished, format="png", metadata=signature(Path("sheet.png")))
     finally:
         pyplot.close(figure)
 

@@ -1,19 +1,31 @@
-"""Which folders a command may replace: those that carry its own mark, and that hold nothing it reads.
+"""Which folders and files a command may replace: those that carry its own mark, and that hold nothing it reads.
 
 Every folder that is written here holds a small file, ``.fillerbuster.json``: who made it, of what kind it is, and the names of all its
 files. A folder without that mark is somebody else's, whatever it looks like; so is every file in it that the mark does not name.
+Single files whose names people type (sheets, figures, tables) say in themselves who made them.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 MARK_NAME = ".fillerbuster.json"
 _MADE_BY, _FORMAT = "fillerbuster", 1
+_LOOKED_AT_BYTES = 8192  # of a file's beginning, and of its end
+_RESULTS = (  # a file's first bytes, and what else stands near its beginning or its end
+    (rb"\x89PNG\r\n", rb"Software\x00fillerbuster"),
+    (rb"<\?xml", rb"<dc:title>fillerbuster</dc:title>"),
+    (rb"%PDF", rb"/Creator \(fillerbuster\)"),
+    (rb"\{\s*\"command\": \"fillerbuster ", rb"\"rows\": "),
+    (rb"part,", rb"part,"),
+    (rb"\*\*|`", rb"\n?`fillerbuster [^`\n]*`, commit [^\n]*\n\Z"),
+)
+"""How results that people name begin: pictures, reports in JSON, tables in CSV and Markdown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +52,10 @@ class Target:
             return
         if not folder.is_dir():
             raise ValueError(f"{folder} exists already and is not empty, for it is a file; choose another name")
+        if os.path.ismount(folder):  # the system lets nothing take its place, and would say so only after all the work
+            raise ValueError(f"{folder} is the root of a disk, whose place nothing can take; choose a new folder in it")
+        if _is_or_holds(folder, _here()):  # else whoever works in it is left in a folder that is there no more
+            raise ValueError(f"{folder} is, or holds, the folder that this command was started in; choose a new folder in it")
         for given in self.inputs:
             if _is_or_holds(folder, given):
                 raise ValueError(f"{folder} holds the input {given}; choose another folder")
@@ -61,6 +77,37 @@ def as_target(folder: Path | Target, kind: str) -> Target:
     return folder if isinstance(folder, Target) else Target(folder=folder, kind=kind)
 
 
+def require_own_or_new(path: Path) -> None:
+    """Raises ValueError in one sentence where a file is to be written in whose place stands one that is no earlier result.
+
+    Pipes and devices are written as they are.
+    """
+    path = real_place(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        return
+    if path.is_symlink() or path.is_dir():
+        raise ValueError(f"{path} is a link or a folder, which a file does not replace; choose another name")
+    if not path.exists() or path.stat().st_size == 0:
+        return
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            begins = file.read(_LOOKED_AT_BYTES)
+            file.seek(max(0, size - _LOOKED_AT_BYTES))
+            ends = file.read()
+    except OSError:
+        begins = ends = b""
+    if not any(re.match(first, begins) and (re.search(also, begins) or re.search(also, ends)) for first, also in _RESULTS):
+        raise ValueError(f"{path} exists already and is no earlier result of this program; choose another name, or move it away")
+
+
+def signature(path: Path) -> dict[str, str]:
+    """The metadata by which a figure that matplotlib saves under this name, with this suffix, says who made it."""
+    keys = {".png": "Software", ".svg": "Creator", ".pdf": "Creator"}
+    suffix = path.suffix.lower()
+    return {keys[suffix]: _MADE_BY} if suffix in keys else {}
+
+
 def write_mark(folder: Path, kind: str) -> None:
     """The mark of a finished folder. It is the same for the same content."""
     (folder / MARK_NAME).write_text(mark_text(kind, _files(folder)), encoding="utf-8")
@@ -72,16 +119,15 @@ def mark_text(kind: str, files: list[str]) -> str:
 
 
 def kind_of(folder: Path) -> str | None:
-    """What the folder's mark says that it holds; None without a mark."""
+    """What the folder's mark says that it holds; None without a mark, or with one that does not say all that a mark says."""
     told = _mark(folder)
-    return None if told is None else str(told.get("kind"))
+    return None if told is None else told["kind"]
 
 
 def foreign_files(folder: Path) -> list[str]:
     """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no mark tells."""
     told = _mark(folder)
-    own = told.get("files") if told is not None else None
-    return sorted(set(_files(folder)) - {name for name in own if isinstance(name, str)}) if isinstance(own, list) else []
+    return [] if told is None else sorted(set(_files(folder)) - {name for name in told["files"] if isinstance(name, str)})
 
 
 def _mark(folder: Path) -> dict | None:
@@ -90,7 +136,17 @@ def _mark(folder: Path) -> dict | None:
         told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
     except (OSError, ValueError, RecursionError):
         return None
-    return told if isinstance(told, dict) and told.get("made_by") == _MADE_BY else None
+    if not isinstance(told, dict) or told.get("made_by") != _MADE_BY or told.get("format") != _FORMAT:
+        return None  # of others, or of a version to come, whose marks may mean something else
+    return told if isinstance(told.get("kind"), str) and isinstance(told.get("files"), list) else None
+
+
+def _here() -> Path:
+    """The folder that this process works in; "/" where somebody has removed it."""
+    try:
+        return Path.cwd()
+    except OSError:
+        return Path("/")
 
 
 def _files(folder: Path) -> list[str]:
