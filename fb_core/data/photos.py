@@ -18,10 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media, video
+from fb_core.data.capture_layouts import layout_of
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.exif import read_exif
 from fb_core.data.own_files import lies_inside
-from fb_core.data.transforms_json import JSON_NAME
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import resampled
 
@@ -74,8 +74,8 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
     """The photos of a folder (in natural order of names), of a film (in order of time), or of a posed capture (in its order).
 
     Args:
-        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a folder with a
-            transforms.json, whose generated views are left out.
+        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a posed capture in any
+            layout, whose generated views are left out.
         most: at most so many. Photos are chosen by coverage and keep their order; frames by sharpness and even motion, and they are
             ``FILM_FRAMES`` when None.
 
@@ -88,7 +88,7 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
     try:
         if not source.exists():
             raise ValueError(f"photos {source}: no such folder or film; check the path")
-        if source.is_dir() and not (source / JSON_NAME).is_file():
+        if source.is_dir() and layout_of(source) is None:
             photos = _of_folder(source)
         elif source.is_dir() or source.suffix.lower() == ".json":
             photos = _of_capture(source)
