@@ -245,7 +245,7 @@ def _sizes_on_disk(cameras: Cameras, frames: list[Frame], files: list[Path]) -> 
     """Copies whose sides were rounded up, which nerfstudio counts as rounded down, get their real sizes."""
     for index, (frame, path) in enumerate(zip(frames, files, strict=True)):
         try:
-            height, width = media.image_size(path, apply_orientation=False)
+            height, width = media.posed_size(path)
         except ValueError:
             continue  # reading it tells what is wrong
         asked = (int(cameras.width[index]), int(cameras.height[index]))

@@ -232,7 +232,7 @@ def _folder_of(model: Path) -> Path:
 def _of_size_on_disk(camera: Pinholes, path: Path) -> Pinholes:
     """The camera of the picture as it lies there: people make pictures smaller after COLMAP has run, and keep the model."""
     try:
-        height, width = media.image_size(path, apply_orientation=False)
+        height, width = media.posed_size(path)
     except ValueError:
         return camera  # the check tells what is wrong with the file
     shape = abs(width * camera.height - height * camera.width)

@@ -89,7 +89,7 @@ class Frame:
     def _load(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
         size = (self.camera.height, self.camera.width)
         upright = media.fits_only_upright(self.image_path, size)
-        image, alpha = media.read_image_with_alpha(self.image_path, apply_orientation=upright)
+        image, alpha = media.read_photo(self.image_path, apply_orientation=upright)
         if tuple(image.shape[1:]) != size:
             stored = media.image_size(self.image_path, apply_orientation=False)
             raise ValueError(_wrong_size(self, "image", self.image_path, stored))
@@ -99,7 +99,7 @@ class Frame:
             if tuple(painted.shape[1:]) != size:
                 raise ValueError(_wrong_size(self, "mask", self.mask_path, tuple(painted.shape[1:])))
             mask = mask * painted
-        return image.clamp(0, 1), mask
+        return image, mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,7 +246,7 @@ def validate_capture(folder: str | Path, *, decode: bool = False) -> Capture:
         for kind, path in (("image", frame.image_path), ("mask", frame.mask_path)):
             if path is None:
                 continue
-            stored = media.image_size(path, apply_orientation=False)
+            stored = media.posed_size(path)
             if stored != (frame.camera.height, frame.camera.width):
                 raise ValueError(_wrong_size(frame, kind, path, stored))
         if decode:

@@ -65,7 +65,7 @@ def camera_from(where: str, image_path: Path, entry: dict[str, Any], shared: dic
         if min(width, height) < 1 or width % 1 or height % 1:
             raise ValueError(f"{where}: expected w and h in whole pixels, at least 1, got {width:g} and {height:g}; correct the file")
     else:
-        height, width = media.image_size(image_path, apply_orientation=False)
+        height, width = media.posed_size(image_path)
     focal_x = _focal(where, values, "fl_x", "camera_angle_x", width)
     if focal_x is None:
         raise ValueError(f"{where}: intrinsics are missing, expected fl_x (pixels) or camera_angle_x (radians); process the pictures again")
