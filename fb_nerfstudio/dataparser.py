@@ -1,5 +1,4 @@
-"""Captures with a transforms.json for nerfstudio, read by this project's reader: whatever the check lets pass is trained, and as it is
-meant.
+"""Captures for nerfstudio, read by this project's reader: whatever the check lets pass is trained, and as it is meant.
 
 Same outputs as nerfstudio's own dataparser where that reads a capture rightly (tests compare them), without its obstacles: open3d, which
 needs a system library; questions on a terminal that may not be there; poses in single precision before they are centred; keys that must
@@ -80,10 +79,10 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         capture = read_capture(self.config.data)
         frames, world = self._world_of(capture)
-        self._file(frames[0].image_path, capture.root, "images_")  # decides the factor of smaller copies, also for a split without frames
+        self._decide_factor(frames[0].image_path, capture)
         photos = [place for place, frame in enumerate(frames) if not frame.generated and not frame.is_bad]
         chosen = self._chosen(capture, frames, photos, split)
-        files = [self._file(frames[place].image_path, capture.root, "images_") for place in chosen]
+        files = [self._file(frames[place].image_path, capture, "images_") for place in chosen]
         masks = [frames[place].mask_path for place in chosen]
         scale, applied = world.scale, capture.extra.get("applied_transform")
         transform = world.transform
@@ -96,13 +95,13 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         points = {} if not self.config.load_3D_points else self._points(capture, world)
         return DataparserOutputs(
             image_filenames=files,
-            cameras=self._cameras([frames[place] for place in chosen], world.poses[chosen], capture),
+            cameras=self._cameras([frames[place] for place in chosen], world.poses[chosen], capture, files),
             scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
-            mask_filenames=[self._file(mask, capture.root, "masks_") for mask in masks if mask is not None] or None,
+            mask_filenames=[self._file(mask, capture, "masks_") for mask in masks if mask is not None] or None,
             dataparser_scale=scale * float(capture.extra.get("applied_scale", 1.0)),
             dataparser_transform=transform if self._is_far(capture) else transform.float(),
             metadata={
-                "depth_filenames": self._depths(frames, chosen, capture.root),
+                "depth_filenames": self._depths(frames, chosen, capture),
                 "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
                 "mask_color": self.config.mask_color,
                 **points,
@@ -157,7 +156,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
             wanted = listed[other] if other in listed else names - listed["train"]
         return [place for place in photos if _name(frames[place].image_path) in wanted]
 
-    def _cameras(self, frames: list[Frame], poses: Tensor, capture: Capture) -> Cameras:
+    def _cameras(self, frames: list[Frame], poses: Tensor, capture: Capture, files: list[Path]) -> Cameras:
         lenses = [{key: frame.distortion.get(key, 0.0) for key in DISTORTION_KEYS} for frame in frames]
         for frame, lens in zip(frames, lenses, strict=True):
             if frame.camera_model in FISHEYE_MODELS and not any(lens.values()):
@@ -179,32 +178,41 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
             camera_type=one_type if one_type is not None else torch.tensor([[one.value] for one in types]),
             metadata={"fisheye_crop_radius": radius} if bent and radius is not None else {},
         )  # fmt: skip
-        assert self.downscale_factor is not None  # `_file` has decided it
-        cameras.rescale_output_resolution(scaling_factor=1.0 / self.downscale_factor)
+        if self._takes_copies(capture):
+            assert self.downscale_factor is not None  # `_decide_factor` has set it
+            cameras.rescale_output_resolution(scaling_factor=capture.reduced / self.downscale_factor)
+            _sizes_on_disk(cameras, frames, files)
         return cameras
 
-    def _file(self, path: Path, root: Path, prefix: str) -> Path:
-        """The picture, or its smaller copy: of the factor asked for, or without one the first that nerfstudio finds small enough."""
+    def _decide_factor(self, path: Path, capture: Capture) -> None:
+        """Sets the factor of smaller copies: the one asked for, or without one the first that nerfstudio finds small enough."""
         if self.downscale_factor is None:
-            self.downscale_factor = self.config.downscale_factor or self._automatic_factor(path, root, prefix)
-        if self.downscale_factor <= 1:
+            self.downscale_factor = self.config.downscale_factor or self._automatic_factor(path, capture)
+
+    def _takes_copies(self, capture: Capture) -> bool:
+        """Whether pictures smaller than the capture's own are asked for."""
+        return self.downscale_factor is not None and self.downscale_factor > capture.reduced
+
+    def _file(self, path: Path, capture: Capture, prefix: str) -> Path:
+        """The picture, or its smaller copy."""
+        if not self._takes_copies(capture):
             return path
-        copy = root / f"{prefix}{self.downscale_factor}" / path.name
+        copy = smaller_copy(path, capture, prefix, self.downscale_factor or 1)
         return path if prefix == "masks_" and not copy.exists() else copy  # a mask of full size is made small with its picture
 
     @staticmethod
-    def _automatic_factor(path: Path, root: Path, prefix: str) -> int:
-        longest, halvings = max(media.image_size(path)), 0
-        while longest / 2**halvings > MAX_AUTO_RESOLUTION and (root / f"{prefix}{2 ** (halvings + 1)}" / path.name).exists():
-            halvings += 1
-        return 2**halvings
+    def _automatic_factor(path: Path, capture: Capture) -> int:
+        longest, factor = max(media.image_size(path)), capture.reduced
+        while longest * capture.reduced / factor > MAX_AUTO_RESOLUTION and smaller_copy(path, capture, "images_", 2 * factor).exists():
+            factor *= 2
+        return factor
 
-    def _depths(self, frames: list[Frame], chosen: list[int], root: Path) -> list[Path] | None:
+    def _depths(self, frames: list[Frame], chosen: list[int], capture: Capture) -> list[Path] | None:
         """Depth pictures, where all frames have one."""
         named = [frame.extra.get("depth_file_path") for frame in frames]
         if not all(isinstance(name, str) for name in named):
             return None
-        return [self._file(root / str(named[place]), root, "depths_") for place in chosen] or None
+        return [self._file(capture.root / str(named[place]), capture, "depths_") for place in chosen] or None
 
     def _points(self, capture: Capture, world: _World) -> dict[str, Tensor]:
         """Positions in the training world (float32 [n, 3]) and colours (uint8 [n, 3]); nothing without points."""
@@ -222,6 +230,31 @@ def without_open3d(config: DataParserConfig) -> DataParserConfig:
     if config._target is Nerfstudio:
         config._target = NerfstudioWithoutOpen3d
     return config
+
+
+def smaller_copy(path: Path, capture: Capture, prefix: str, factor: int) -> Path:
+    """Where the copy of a picture, mask or depth lies that is smaller by a factor: in images_4 and the like, with or without the folders
+    below images in which a rig's pictures lie."""
+    folder = capture.root / f"{prefix}{factor}"
+    parts = path.relative_to(capture.root).parts[1:] if path.is_relative_to(capture.root) else ()
+    deep = folder.joinpath(*parts)
+    return deep if len(parts) > 1 and deep.exists() else folder / path.name
+
+
+def _sizes_on_disk(cameras: Cameras, frames: list[Frame], files: list[Path]) -> None:
+    """Copies whose sides were rounded up, which nerfstudio counts as rounded down, get their real sizes."""
+    for index, (frame, path) in enumerate(zip(frames, files, strict=True)):
+        try:
+            height, width = media.posed_size(path)
+        except ValueError:
+            continue  # reading it tells what is wrong
+        asked = (int(cameras.width[index]), int(cameras.height[index]))
+        if (width, height) == asked or max(abs(width - asked[0]), abs(height - asked[1])) > 1:
+            continue  # as expected, or no copy of this picture, which its reader tells
+        camera = frame.camera.scaled(width, height)
+        cameras.width[index], cameras.height[index] = width, height
+        cameras.fx[index], cameras.fy[index] = camera.focal[0]
+        cameras.cx[index], cameras.cy[index] = camera.principal[0]
 
 
 def _name(path: Path) -> str:

@@ -17,7 +17,7 @@ from fb_core.data import media
 from fb_core.data.captures import Capture, Frame, split_lists, splits_of, write_transforms
 from fb_core.data.colmap_model import ColmapImage, write_colmap
 from fb_core.data.own_files import own_pictures, own_points
-from fb_core.data.points import Points, read_points, write_points
+from fb_core.data.points import Points, copy_points, read_points, write_points
 from fb_core.files.ownership import Target, as_target
 from fb_core.files.whole import whole_folder
 from fb_nerfstudio.saved_run import CompletedCapture
@@ -135,7 +135,7 @@ def _write_nerfstudio(folder: Path, capture: Capture, frames: list[Frame], point
     if points is not None:
         write_points(folder / "points3D.ply", points)
     elif points_path is not None and own is not None:
-        shutil.copyfile(own, points_path)
+        copy_points(own, points_path)
     extra: dict[str, Any] = {key: value for key, value in capture.extra.items() if key not in _LENS_EXTRAS and key != "camera_model"}
     extra |= split_lists(frames, folder)
     write_transforms(Capture(root=folder, frames=tuple(frames), points_path=points_path, extra=extra), folder)

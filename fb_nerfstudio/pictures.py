@@ -23,9 +23,9 @@ class CapturePictures(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """[h, w, 3 or 4] of the camera's size. Raises ValueError in one sentence for a file that cannot be read."""
         path = self._dataparser_outputs.image_filenames[image_idx]
-        pixels, alpha = media.read_image_with_alpha(path, apply_orientation=self._turned(image_idx))
+        pixels, alpha = media.read_photo(path, apply_orientation=self._turned(image_idx))
         channels = pixels if alpha is None else torch.cat([pixels, alpha])
-        picture = Image.fromarray((channels.clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).numpy())
+        picture = Image.fromarray((channels * 255).round().to(torch.uint8).movedim(0, -1).numpy())
         if self.scale_factor != 1.0:
             size = (int(picture.width * self.scale_factor), int(picture.height * self.scale_factor))
             picture = picture.resize(size, resample=Image.Resampling.BILINEAR)

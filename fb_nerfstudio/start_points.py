@@ -8,12 +8,13 @@ from __future__ import annotations
 import logging
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
-from fb_core.data.media import read_image, read_image_with_alpha, resize
+from fb_core.data.media import fits_only_upright, read_mask, read_photo, resize
 from fb_core.data.undistort import check_lens, straight_directions
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import CaptureShape
@@ -61,16 +62,19 @@ class _Photo:
         lens = _lens(cameras, index)
         if lens is None:
             return None
-        image, alpha = read_image_with_alpha(outputs.image_filenames[index], apply_orientation=False)  # as nerfstudio reads it
+        path = outputs.image_filenames[index]
+        turned = fits_only_upright(path, (int(cameras.height[index]), int(cameras.width[index])))
+        image, alpha = read_photo(path, apply_orientation=turned)
         scale = min(1.0, _SIDE / max(image.shape[1:]))
         height, width = (max(1, round(side * scale)) for side in image.shape[1:])
         masks = [] if alpha is None else [alpha]
         if outputs.mask_filenames is not None:
-            masks.append(read_image(outputs.mask_filenames[index], apply_orientation=False)[:1])
+            mask = read_mask(outputs.mask_filenames[index], apply_orientation=turned)
+            masks.append(F.interpolate(mask[None], size=image.shape[1:])[0])  # masks may be larger than a small copy of their picture
         known = torch.stack([(mask >= 0.5).to(image) for mask in masks]).amin(dim=0) if masks else torch.ones_like(image[:1])
         image, known = wholly_known(image, known, lambda channels: resize(channels, height, width))
         camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)
-        return cls(image.clamp(0, 1), known if masks else None, camera, *lens)
+        return cls(image, known if masks else None, camera, *lens)
 
     def world_directions(self, places: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
         return straight_directions(places, self.camera, self.model, self.distortion) @ self.camera.rotations[0].T

@@ -17,7 +17,7 @@ from fb_core.data import media
 from fb_core.data.captures import Capture, Frame, split_lists, write_transforms
 from fb_core.data.film import write_film
 from fb_core.data.photos import Photo
-from fb_core.data.points import Points, read_points
+from fb_core.data.points import Points, copy_points, read_points
 from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
 from fb_core.files.faults import is_of_the_disk
@@ -82,7 +82,7 @@ def write_folder(
         points = None if world.points_path is None else read_points(world.points_path)
         _write_capture(folder, photos, found, new, world, points is not None)
         if world.points_path is not None:
-            shutil.copyfile(world.points_path, folder / "points3D.ply")
+            copy_points(world.points_path, folder / "points3D.ply")
         _draw(folder / "cameras.png", photos, found, new, points)
     _write_raymaps(folder / "raymaps", photos, found)
     _write_sheet(folder / "sheet.png", photos, left_out, found, new)

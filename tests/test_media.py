@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
-from fb_core.data import media
+from fb_core.data import media, picture_decoders
 
 DAMAGED = "truncated|damaged|empty|not readable"
 
@@ -134,7 +134,7 @@ def test_upright_moves_the_named_corner(orientation: int) -> None:
     }[orientation]
     stored = torch.zeros(2, 3, 5)
     stored[0, 0, :], stored[1, :, 0] = 1, 1
-    upright = media._upright(stored, orientation)
+    upright = picture_decoders.upright(stored, orientation)
     sides = {"top": (0, slice(None)), "bottom": (-1, slice(None)), "left": (slice(None), 0), "right": (slice(None), -1)}
     for channel, side in ((0, row_is), (1, column_is)):
         assert (upright[channel][sides[side]] == 1).all()
@@ -144,7 +144,7 @@ def test_upright_moves_the_named_corner(orientation: int) -> None:
 def test_unknown_orientation_counts_as_upright() -> None:
     image = picture()
     for orientation in (0, 9, -3):
-        assert torch.equal(media._upright(image, orientation), image)
+        assert torch.equal(picture_decoders.upright(image, orientation), image)
 
 
 # ---- named float channels -------------------------------------------------------------------------------------------

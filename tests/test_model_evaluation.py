@@ -151,8 +151,8 @@ def test_scores_of_hidden_views(tiny_capture: Path):
 @pytest.mark.parametrize(
     ("file", "said"),
     [
-        ("sparse/0/cameras.bin", "a COLMAP model; run ns-process-data"),
-        ("transforms_train.json", "a Blender scene"),
+        ("sparse/0/cameras.bin", "a part of a COLMAP model; copy its files images and cameras"),
+        ("transforms_spheric.json", "a Blender scene without a transforms_train.json"),
         ("a/film.MP4", "a film; run fillerbuster complete"),
         ("images/1.JPG", "photos without cameras"),
         ("00000.tar", "WebDataset shards"),

@@ -40,7 +40,7 @@ _FILMS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
 
 
 def capture_folders(data: Path) -> list[Path]:
-    """Every folder with a transforms.json at or below ``data``. Raises ValueError that says what it looks like otherwise."""
+    """Every folder that holds a capture at or below ``data``. Raises ValueError that says what it looks like otherwise."""
     if not data.is_dir():
         raise ValueError(f"data: expected a folder of captures, got {data}, which is none; check the path")
     try:
@@ -51,13 +51,13 @@ def capture_folders(data: Path) -> list[Path]:
 
 
 def looks_like(folder: Path) -> tuple[str, str]:
-    """What a folder without transforms.json seems to be, and what turns it into a capture."""
+    """What a folder without captures seems to be, and what turns it into one."""
     files = [path for path in sorted(folder.rglob("*"))[:10_000] if path.is_file()]
     names, suffixes = {path.name for path in files}, {path.suffix.lower() for path in files}
     if names & {"cameras.bin", "cameras.txt"}:
-        return "a COLMAP model", "run ns-process-data images --skip-colmap on it"
+        return "a part of a COLMAP model", "copy its files images and cameras (both .bin, or both .txt) beside one another"
     if any(name.startswith("transforms_") and name.endswith(".json") for name in names):
-        return "a Blender scene with one transforms file for each split", "name the one to use transforms.json"
+        return "a Blender scene without a transforms_train.json", "name the file to use transforms.json"
     if any(path.suffix == ".tar" for path in files):
         return "WebDataset shards, which have no cameras", "give captures"
     if suffixes & _FILMS:

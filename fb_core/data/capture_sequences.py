@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media
+from fb_core.data.capture_layouts import layouts_below
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, task_order, training_frame
 from fb_core.data.transforms_json import JSON_NAME
@@ -52,13 +53,16 @@ class CaptureConfig:
 
 
 def find_captures(folder: Path) -> list[Path]:
-    """Every folder with a transforms.json at or below ``folder``, sorted (ScanNet++: SCENE/dslr/nerfstudio/transforms.json).
+    """Every folder at or below ``folder`` that holds a capture in a layout of :mod:`fb_core.data.capture_layouts`, sorted.
 
     Raises ValueError if there is none.
     """
-    found = sorted(path.parent for path in Path(folder).rglob(JSON_NAME)) if Path(folder).is_dir() else []
+    found = layouts_below(Path(folder)) if Path(folder).is_dir() else []
     if not found:
-        raise ValueError(f"captures: expected folders with a {JSON_NAME} at or below {folder}, found none; check the path")
+        raise ValueError(
+            f"captures: expected folders with a {JSON_NAME}, a transforms_train.json or a COLMAP model at or below {folder}, found none; "
+            "check the path"
+        )
     return found
 
 
@@ -141,27 +145,18 @@ class TrainingCapture:
 
 
 def read_training_capture(folder: Path) -> TrainingCapture:
-    """A capture without the frames that it calls bad. Pictures of ScanNet++ are found in the folders beside that of the JSON file.
+    """A capture without the frames that it calls bad, and without ScanNet++'s test frames.
 
     Raises ValueError for what cannot be read, and for a capture without usable frames.
     """
     capture = read_capture(folder)
-    frames = tuple(_beside(frame, folder) for frame in capture.frames if not frame.extra.get("is_bad"))
+    frames = tuple(frame for frame in capture.frames if not frame.is_bad and not frame.extra.get("held_out"))
     if not frames:
-        raise ValueError(f"capture {folder}: every frame is marked is_bad; leave this folder out")
+        raise ValueError(f"capture {folder}: every frame is marked is_bad or held_out; leave this folder out")
     centers = torch.cat([frame.camera.centers for frame in frames])
     center = centers.mean(dim=0)
     extent = float((centers - center).abs().max())
     return TrainingCapture(frames=frames, center=center, extent=extent if extent > 1e-9 else 1.0)
-
-
-def _beside(frame: Frame, folder: Path) -> Frame:
-    """The frame with its files in ScanNet++'s places, if they are there."""
-    images, masks = (folder.parent / name for name in ("resized_images", "resized_anon_masks"))
-    if frame.image_path.is_file() or not images.is_dir():
-        return frame
-    mask = None if frame.mask_path is None or not masks.is_dir() else masks / frame.mask_path.name
-    return dataclasses.replace(frame, image_path=images / frame.image_path.name, mask_path=mask)
 
 
 def strided(frames: int, views: int, stride: int, *, generator: torch.Generator) -> list[int]:

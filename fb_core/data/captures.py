@@ -28,10 +28,13 @@ from fb_core.data.transforms_json import (
     camera_from,
     checked_pose,
     finite_number,
+    listed_lens,
     load_transforms,
+    model_of,
     to_json,
+    with_suffix,
 )
-from fb_core.data.undistort import FISHEYE_MODELS, PERSPECTIVE_MODELS, check_lens, check_straight, undistort
+from fb_core.data.undistort import check_lens, check_straight, undistort
 from fb_core.files.ownership import Target
 from fb_core.files.whole import settled, whole_file, whole_folder
 from fb_core.geometry.cameras import Pinholes
@@ -39,7 +42,6 @@ from fb_core.geometry.cameras import Pinholes
 FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
 CAPTURE_KEYS = ("frames", "ply_file_path", *INTRINSIC_KEYS)
 _ORIENTATIONS = ("pca", "up", "vertical", "none")  # nerfstudio's
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".exr")
 _SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")  # lists of file_path
 
 
@@ -87,7 +89,7 @@ class Frame:
     def _load(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
         size = (self.camera.height, self.camera.width)
         upright = media.fits_only_upright(self.image_path, size)
-        image, alpha = media.read_image_with_alpha(self.image_path, apply_orientation=upright)
+        image, alpha = media.read_photo(self.image_path, apply_orientation=upright)
         if tuple(image.shape[1:]) != size:
             stored = media.image_size(self.image_path, apply_orientation=False)
             raise ValueError(_wrong_size(self, "image", self.image_path, stored))
@@ -97,7 +99,7 @@ class Frame:
             if tuple(painted.shape[1:]) != size:
                 raise ValueError(_wrong_size(self, "mask", self.mask_path, tuple(painted.shape[1:])))
             mask = mask * painted
-        return image.clamp(0, 1), mask
+        return image, mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,9 +111,11 @@ class Capture:
     frames: tuple[Frame, ...]
     """In the order of the file (nerfstudio sorts them by name)."""
     points_path: Path | None = None
-    """A PLY file of coloured points in the capture's world."""
+    """Coloured points in the capture's world: a PLY file, or COLMAP's points3D."""
     extra: dict[str, Any] = field(default_factory=dict)
     """All other top-level keys (applied_transform, train_filenames, ...), as they stand in the file."""
+    reduced: int = 1
+    """Where the full pictures are not there but images_2 (or 4, 8): that factor; cameras are of the pictures that are there."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -159,34 +163,52 @@ class FrameToWrite:
 
 
 def read_capture(folder: str | Path) -> Capture:
-    """The capture in a folder with a transforms.json, or in the JSON file given.
+    """The capture in a folder, or in the JSON file given.
 
-    Intrinsics may stand at the top (they win, as in nerfstudio) or in each frame; a focal may be given as camera_angle_x; a missing
-    size is taken from the picture. Pictures are not opened otherwise: see :func:`validate_capture`.
+    A folder holds a transforms.json, or is in one of the layouts of :mod:`fb_core.data.capture_layouts` (Blender's files for each split,
+    ScanNet++, a COLMAP model). Intrinsics may stand at the top (they win, as in nerfstudio) or in each frame; a focal may be given as
+    camera_angle_x; a missing size is taken from the picture. Pictures are not opened otherwise: see :func:`validate_capture`.
 
     Raises:
         ValueError: one sentence, for a missing folder or file, bad JSON, no frames, and bad or missing poses and intrinsics.
     """
+    from fb_core.data.capture_layouts import Layout, layout_of, read_layout  # which reads into the types of this module
+
     path = Path(folder)
     if not path.exists():
         settled(path.parent if path.suffix.lower() == ".json" else path)
     if not path.exists():
         raise ValueError(f"capture {path}: no such folder; check the path")
-    if path.is_dir():
-        path = path / JSON_NAME
-        if not path.is_file():
-            raise ValueError(f"capture {path.parent}: no {JSON_NAME} in this folder; run ns-process-data, or check the path")
+    layout = layout_of(path) if path.is_dir() else Layout(kind="transforms", path=path)
+    if layout is None:
+        raise ValueError(
+            f"capture {path}: no {JSON_NAME} in this folder, no transforms_train.json and no COLMAP model (sparse/0); run ns-process-data, "
+            "or check the path"
+        )
+    return read_layout(layout)
+
+
+def read_transforms(path: Path, *, frames: str = "frames", optional: bool = False) -> Capture:
+    """The capture of one JSON file.
+
+    Args:
+        path: the file.
+        frames: key of the list of frames.
+        optional: take a missing list for an empty one.
+
+    Raises ValueError as :func:`read_capture`.
+    """
     meta = load_transforms(path)
-    frames = meta.get("frames")
-    if not isinstance(frames, list) or not frames:
-        got = "no frames" if frames in (None, []) else f"frames of type {type(frames).__name__}"
-        raise ValueError(f"capture {path}: expected a list 'frames' with at least one camera, got {got}; process the pictures again")
+    entries = meta.get(frames)
+    if not (optional and entries in (None, [])) and (not isinstance(entries, list) or not entries):
+        got = "no frames" if entries in (None, []) else f"frames of type {type(entries).__name__}"
+        raise ValueError(f"capture {path}: expected a list '{frames}' with at least one camera, got {got}; process the pictures again")
     points = meta.get("ply_file_path")
     if not (points is None or isinstance(points, str)):
         raise ValueError(f"capture {path}: expected a file name for ply_file_path, got {points!r}; correct the file")
     return Capture(
         root=path.parent,
-        frames=tuple(_read_frame(path, index, entry, meta) for index, entry in enumerate(frames)),
+        frames=tuple(_read_frame(path, index, entry, meta) for index, entry in enumerate(entries or ())),
         points_path=None if points is None else path.parent / points,
         extra={key: value for key, value in meta.items() if key not in CAPTURE_KEYS},
     )
@@ -224,7 +246,7 @@ def validate_capture(folder: str | Path, *, decode: bool = False) -> Capture:
         for kind, path in (("image", frame.image_path), ("mask", frame.mask_path)):
             if path is None:
                 continue
-            stored = media.image_size(path, apply_orientation=False)
+            stored = media.posed_size(path)
             if stored != (frame.camera.height, frame.camera.width):
                 raise ValueError(_wrong_size(frame, kind, path, stored))
         if decode:
@@ -312,8 +334,8 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError(f"{where}: expected an object with a 'file_path', got {str(entry)[:80]}; process the pictures again")
     where += f" ({entry['file_path']})"
-    image_path = _with_suffix(json_path.parent / entry["file_path"])
-    lens = _lens(where, shared if any(key in shared for key in (*DISTORTION_KEYS, "distortion_params")) else entry)
+    image_path = with_suffix(json_path.parent / entry["file_path"])
+    lens = listed_lens(where, shared if any(key in shared for key in (*DISTORTION_KEYS, "distortion_params")) else entry)
     mask = entry.get("mask_path")
     if not (mask is None or isinstance(mask, str)):
         raise ValueError(f"{where}: expected a file name for mask_path, got {mask!r}; correct the file")
@@ -322,34 +344,9 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
         mask_path=None if mask is None else json_path.parent / mask,
         camera=camera_from(where, image_path, entry, shared),
         distortion={key: finite_number(where, lens, key) for key in DISTORTION_KEYS if key in lens},
-        camera_model=_model_of(entry, shared),
+        camera_model=model_of(entry, shared),
         extra={key: value for key, value in entry.items() if key not in FRAME_KEYS},
     )
-
-
-def _with_suffix(path: Path) -> Path:
-    """The file itself, or, for a name without a suffix as Blender's tools write it, the picture of that name."""
-    if path.suffix or path.exists():
-        return path
-    return next((named for suffix in _SUFFIXES if (named := path.with_name(path.name + suffix)).exists()), path)
-
-
-def _lens(where: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The same keys with nerfstudio's list of coefficients, if there is one, spread over k1, k2, k3, k4, p1, p2."""
-    listed = values.get("distortion_params")
-    if listed is None or values.get("camera_model", "OPENCV") not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS):
-        return values  # models that are not supported have lists of their own
-    if not isinstance(listed, list) or len(listed) != len(DISTORTION_KEYS):
-        raise ValueError(
-            f"{where}: expected distortion_params as six numbers k1, k2, k3, k4, p1, p2, got {str(listed)[:60]}; correct the file"
-        )
-    return {**values, **dict(zip(DISTORTION_KEYS, listed, strict=True))}
-
-
-def _model_of(entry: dict[str, Any], shared: dict[str, Any]) -> str:
-    """The lens model's name; instant-ngp's ``is_fisheye`` says it, too."""
-    fisheye = shared.get("is_fisheye", entry.get("is_fisheye", False)) is True
-    return str(shared.get("camera_model", entry.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV")))
 
 
 def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, ...]) -> str:

@@ -1,7 +1,10 @@
 """Still images in and out: files on one side, float tensors (3 h w, range [0, 1]) on the other.
 
 OpenImageIO does the decoding and is imported on first use. Orientation tags of phones (EXIF) are honoured. Every reader
-raises ``ValueError`` with one sentence for a file that is missing, empty, cut short, or not an image.
+raises ``ValueError`` with one sentence for a file that is missing, empty, cut short, or not an image, whatever its decoder raises.
+
+A picture is what its file means to show: the display window of an EXR file (pixels outside of its data window are unknown), colours that
+are not multiplied by alpha.
 """
 
 from __future__ import annotations
@@ -18,6 +21,21 @@ from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.picture_decoders import (
+    LEAST_ALPHA,
+    TIFF_SUFFIXES,
+    colour_channels,
+    covers_display,
+    decode,
+    decode_heif,
+    display_size,
+    one_line,
+    opened,
+    opened_heif,
+    orientation_of,
+    told,
+    upright,
+)
 from fb_core.files.whole import by_way_of_memory
 from fb_core.limits import require_decodable
 
@@ -47,18 +65,32 @@ def read_image_with_alpha(
     The colours are not multiplied by alpha (except in EXR files, whose definition wants it so).
     """
     path = _checked_file(path)
-    pixels, names, orientation = _decode_heif(path) if path.suffix.lower() in HEIF_SUFFIXES else _decode(path)
-    if apply_orientation:
-        pixels = _upright(pixels, orientation)
-    alpha = pixels[names.index("A")][None] if "A" in names else None
-    if names[:3] == ["R", "G", "B"]:
-        return pixels[:3], alpha
-    if {"R", "G", "B"} <= set(names):
-        return pixels[[names.index(name) for name in "RGB"]], alpha
-    luminance = [index for index, name in enumerate(names) if name in ("Y", "I", "L")] or ([0] if len(names) == 1 else [])
-    if not luminance:
-        raise ValueError(f"image {path}: expected channels R, G, B or one grey channel, got {names}; read it with read_exr")
-    return repeat(pixels[luminance[0]], "h w -> channels h w", channels=3), alpha
+    with told(path):
+        pixels, names, orientation = decode_heif(path) if path.suffix.lower() in HEIF_SUFFIXES else decode(path)
+        if apply_orientation:
+            pixels = upright(pixels, orientation)
+        colours, opaque = colour_channels(names, path)
+        alpha = None if opaque is None else pixels[opaque][None]
+        if colours == [0, 1, 2]:
+            return pixels[:3], alpha
+        if len(colours) == 3:
+            return pixels[colours], alpha
+        return repeat(pixels[colours[0]], "h w -> channels h w", channels=3), alpha
+
+
+def read_photo(path: str | Path, *, apply_orientation: bool = True) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"] | None]:
+    """Like :func:`read_image_with_alpha`, as the picture is looked at: sRGB in [0, 1], whatever the file.
+
+    Colours of EXR files, which are linear and multiplied by alpha, are converted; their pixels that are not finite are transparent.
+    """
+    image, alpha = read_image_with_alpha(path, apply_orientation=apply_orientation)
+    if Path(path).suffix.lower() == ".exr":
+        opaque = torch.ones_like(image[:1]) if alpha is None else alpha.clamp(0, 1)
+        image = to_srgb(image / opaque.clamp(min=LEAST_ALPHA))
+        finite = torch.isfinite(image).all(dim=0, keepdim=True)
+        image = torch.where(finite, image, 0.0)
+        alpha = alpha if alpha is None and bool(finite.all()) else opaque.nan_to_num(0.0) * finite
+    return image.clamp(0, 1), None if alpha is None else alpha.clamp(0, 1)
 
 
 def read_mask(path: str | Path, *, apply_orientation: bool = True) -> Float[Tensor, "1 h w"]:
@@ -71,12 +103,13 @@ def read_mask(path: str | Path, *, apply_orientation: bool = True) -> Float[Tens
 def has_alpha(path: str | Path) -> bool:
     """Whether a still image has an alpha channel, from the file's header (HEIC files are decoded)."""
     path = _checked_file(path)
-    if path.suffix.lower() in HEIF_SUFFIXES:
-        return "A" in _decode_heif(path)[1]
-    reader = _opened(path)
-    names = reader.spec().channelnames
-    reader.close()
-    return "A" in names
+    with told(path):
+        if path.suffix.lower() in HEIF_SUFFIXES:
+            return "A" in decode_heif(path)[1]
+        reader = opened(path)
+        spec = reader.spec()
+        reader.close()
+        return any(name == "A" or name.endswith("Combined.A") for name in spec.channelnames) or not covers_display(spec)
 
 
 def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int, int]:
@@ -85,21 +118,30 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
     A file cut short is refused, and one that could not be decoded here because it is too large.
     """
     path = _checked_file(path)
-    if path.suffix.lower() in HEIF_SUFFIXES:
-        width, height = opened_heif(path).size
-        require_decodable(f"image {path}", height, width, 3)
-        return height, width
-    reader = _opened(path)
-    spec = reader.spec()
-    height, width, orientation = spec.height, spec.width, _orientation(path, spec)
-    reader.close()
-    require_decodable(f"image {path}", height, width, spec.nchannels)
-    return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
+    with told(path):
+        if path.suffix.lower() in HEIF_SUFFIXES:
+            width, height = opened_heif(path).size
+            require_decodable(f"image {path}", height, width, 3)
+            return height, width
+        reader = opened(path)
+        spec = reader.spec()
+        height, width = display_size(spec)
+        orientation = orientation_of(path, spec)
+        reader.close()
+        require_decodable(f"image {path}", max(height, spec.height), max(width, spec.width), spec.nchannels)
+        return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
+
+
+def posed_size(path: str | Path) -> tuple[int, int]:
+    """(height, width) of a posed picture as nerfstudio counts: stored pixels, but TIFF files upright, for Pillow turns these alone."""
+    return image_size(path, apply_orientation=Path(path).suffix.lower() in TIFF_SUFFIXES)
 
 
 def fits_only_upright(path: str | Path, size: tuple[int, int]) -> bool:
     """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in stored pixels, unless
-    only the upright size fits. Headers alone are read."""
+    only the upright size fits; TIFF files the other way round. Headers alone are read."""
+    if Path(path).suffix.lower() in TIFF_SUFFIXES:
+        return image_size(path) == size or image_size(path, apply_orientation=False) != size
     return image_size(path, apply_orientation=False) != size and image_size(path) == size
 
 
@@ -137,7 +179,8 @@ def write_exr(path: str | Path, channels: Mapping[str, Float[Tensor, "h w"]]) ->
 def read_exr(path: str | Path, names: list[str] | None = None) -> dict[str, Float[Tensor, "h w"]]:
     """The named float channels of an EXR file (all of them by default). The order inside the file does not matter."""
     path = _checked_file(path)
-    pixels, stored, _ = _decode(path)
+    with told(path):
+        pixels, stored, _ = decode(path)
     missing = [name for name in names or [] if name not in stored]
     if missing:
         raise ValueError(f"read_exr {path}: channels {missing} are not in the file, which has {stored}; ask for those")
@@ -245,80 +288,6 @@ def _png_is_complete(file) -> bool:
     return False
 
 
-def _opened(path: Path):
-    """An OpenImageIO reader that leaves colours unmultiplied by alpha."""
-    import OpenImageIO as oiio
-
-    settings = oiio.ImageSpec()
-    settings.attribute("oiio:UnassociatedAlpha", 1)
-    reader = oiio.ImageInput.open(str(path), settings)
-    if reader is None:
-        raise ValueError(f"image {path}: not readable as an image ({_one_line(oiio.geterror())}); expected JPEG, PNG, TIFF, EXR or WebP")
-    return reader
-
-
-def _decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
-    """Pixels as stored (float32), the channels' names, and the orientation tag (1 = upright)."""
-    import OpenImageIO as oiio
-
-    reader = _opened(path)
-    spec = reader.spec()
-    require_decodable(f"image {path}", spec.height, spec.width, spec.nchannels)
-    kind = oiio.UINT8 if spec.format == oiio.TypeUInt8 else oiio.FLOAT
-    array = reader.read_image(0, 0, 0, spec.nchannels, kind)
-    error = reader.geterror()
-    reader.close()
-    if array is None or error:
-        raise ValueError(f"image {path}: damaged or truncated ({_one_line(error)}); copy it again from its source")
-    pixels = rearrange(torch.from_numpy(np.ascontiguousarray(array)), "h w c -> c h w")
-    planes = pixels.to(torch.float32, memory_format=torch.contiguous_format)
-    return planes.div_(255) if kind == oiio.UINT8 else planes, list(spec.channelnames), _orientation(path, spec)
-
-
-def _orientation(path: Path, spec) -> int:
-    """The EXIF orientation (1 = upright); of WebP files, whose tags OpenImageIO does not read, by Pillow."""
-    if path.suffix.lower() != ".webp":
-        return spec.get_int_attribute("Orientation", 1)
-    from PIL import ExifTags, Image
-
-    with Image.open(path) as image:
-        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
-
-
-def _decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
-    """Like :func:`_decode` for HEIC photos; their decoder turns them upright itself."""
-    image = opened_heif(path)
-    require_decodable(f"image {path}", image.size[1], image.size[0], 3)
-    try:
-        array = np.array(image)
-    except (OSError, RuntimeError, SyntaxError, ValueError) as error:
-        raise ValueError(f"image {path}: damaged or truncated HEIC ({_one_line(str(error))}); copy it again from its source") from error
-    pixels = rearrange(torch.from_numpy(array), "h w c -> c h w")
-    return pixels.float() / 255, list(image.mode), 1
-
-
-def opened_heif(path: Path):
-    """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency."""
-    try:
-        import pillow_heif  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ValueError(
-            f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install 'fillerbuster[heic]' or convert to JPEG"
-        ) from error
-    try:
-        return pillow_heif.open_heif(path)
-    except (OSError, RuntimeError, SyntaxError, ValueError) as error:
-        raise ValueError(f"image {path}: not readable as HEIC ({_one_line(str(error))}); copy it again or convert it to JPEG") from error
-
-
-def _upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, "c h2 w2"]:
-    """The pixels turned as an EXIF orientation (1 to 8; anything else counts as 1) asks for."""
-    if orientation in (5, 6, 7, 8):
-        pixels = pixels.transpose(1, 2)
-    flips = {2: [2], 3: [1, 2], 4: [1], 6: [2], 7: [1, 2], 8: [1]}.get(orientation, [])
-    return (pixels.flip(flips) if flips else pixels).contiguous()
-
-
 # ---- encoding -------------------------------------------------------------------------------------------------------
 
 
@@ -341,8 +310,4 @@ def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: 
     with by_way_of_memory(path) as place:
         done = writer.open(place, spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()
         if not done:
-            raise ValueError(f"cannot write {path} ({_one_line(writer.geterror())}); check that the folder exists and has room")
-
-
-def _one_line(message: str) -> str:
-    return " ".join(message.split()) or "no reason given"
+            raise ValueError(f"cannot write {path} ({one_line(writer.geterror())}); check that the folder exists and has room")

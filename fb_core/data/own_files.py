@@ -10,6 +10,7 @@ import logging
 from pathlib import Path
 
 from fb_core.data.captures import Capture
+from fb_core.data.points import is_colmap
 
 _HEADER_BYTES = 1 << 16
 _FORMATS = (b"format ascii 1.0", b"format binary_little_endian 1.0", b"format binary_big_endian 1.0")
@@ -29,7 +30,7 @@ def own_points(capture: Capture) -> Path | None:
     if not lies_inside(path, capture.root):
         _logger.warning("left out: ply_file_path names %s, outside of the capture %s; copy it there to have it along", path, capture.root)
         return None
-    if not is_ply(path):
+    if not is_colmap(path) and not is_ply(path):
         _logger.warning("left out: ply_file_path names %s, which is no PLY file by its header; restore it", path)
         return None
     return path

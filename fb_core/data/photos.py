@@ -18,10 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media, video
+from fb_core.data.capture_layouts import layout_of
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.exif import read_exif
 from fb_core.data.own_files import lies_inside
-from fb_core.data.transforms_json import JSON_NAME
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import resampled
 
@@ -74,8 +74,8 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
     """The photos of a folder (in natural order of names), of a film (in order of time), or of a posed capture (in its order).
 
     Args:
-        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a folder with a
-            transforms.json, whose generated views are left out.
+        source: a folder of JPEG, PNG, WebP, TIFF, EXR, BMP or (with the extra ``heic``) HEIC files; a film; a posed capture in any
+            layout, whose generated views are left out.
         most: at most so many. Photos are chosen by coverage and keep their order; frames by sharpness and even motion, and they are
             ``FILM_FRAMES`` when None.
 
@@ -88,7 +88,7 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
     try:
         if not source.exists():
             raise ValueError(f"photos {source}: no such folder or film; check the path")
-        if source.is_dir() and not (source / JSON_NAME).is_file():
+        if source.is_dir() and layout_of(source) is None:
             photos = _of_folder(source)
         elif source.is_dir() or source.suffix.lower() == ".json":
             photos = _of_capture(source)
@@ -114,7 +114,7 @@ def _of_folder(folder: Path) -> list[Photo]:
     if not photos:
         raise ValueError(f"photos {folder}: expected at least 2 photos in the folder, got {_what_else(folder, files)}")
     names = _unique_names([path.stem for path in photos])
-    return _readable(folder, [lambda path=path, name=name: _still(path, name) for path, name in zip(photos, names, strict=True)])
+    return _readable(folder, [(path, partial(_still, path, name)) for path, name in zip(photos, names, strict=True)])
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
@@ -155,13 +155,8 @@ def _still(path: Path, name: str) -> Photo:
 
 
 def _still_pixels(path: Path) -> Pixels:
-    image, alpha = media.read_image_with_alpha(path)
-    mask = torch.ones_like(image[:1]) if alpha is None else alpha.clamp(0, 1)
-    if path.suffix.lower() == ".exr":
-        image = media.to_srgb(image / mask.clamp(min=1e-6))  # colours of EXR files are linear and multiplied by alpha
-        finite = torch.isfinite(image).all(dim=0, keepdim=True)
-        image, mask = torch.where(finite, image, 0.0), mask * finite
-    return image.clamp_(0, 1), mask
+    image, alpha = media.read_photo(path)
+    return image, torch.ones_like(image[:1]) if alpha is None else alpha
 
 
 # ---- posed captures -------------------------------------------------------------------------------------------------
@@ -174,7 +169,7 @@ def _of_capture(folder: Path) -> list[Photo]:
         _logger.info("capture %s: %d generated views are left out", folder, len(capture) - len(frames))
     names = _unique_names([frame.image_path.stem for frame in frames])
     read = partial(_captured, root=capture.root)
-    return _readable(folder, [partial(read, frame, name) for frame, name in zip(frames, names, strict=True)])
+    return _readable(folder, [(frame.image_path, partial(read, frame, name)) for frame, name in zip(frames, names, strict=True)])
 
 
 def _captured(frame: Frame, name: str, *, root: Path) -> Photo:
@@ -230,14 +225,16 @@ def _all_known(image: Float[Tensor, "3 h w"]) -> Pixels:
 # ---- what all share -------------------------------------------------------------------------------------------------
 
 
-def _readable(source: Path, readers: list[Callable[[], Photo]]) -> list[Photo]:
-    """The photos that can be read; the others are named in one warning, or in the error when fewer than two remain."""
+def _readable(source: Path, readers: list[tuple[Path, Callable[[], Photo]]]) -> list[Photo]:
+    """The photos that can be read; the others are named in one warning each, or in the error when fewer than two remain."""
     photos, faults = [], []
-    for read in readers:
+    for path, read in readers:
         try:
             photos.append(read())
         except (ValueError, OSError) as error:
             faults.append(str(error))
+        except Exception as error:  # libraries raise what they like for a damaged file; one photo must not end all
+            faults.append(f"image {path}: not readable ({type(error).__name__}: {' '.join(str(error).split())[:200]})")
     if len(photos) < 2:
         reason = (
             f" ({len(faults)} cannot be read; the first: {faults[0]})" if faults else "; add photos that show the same scene from elsewhere"

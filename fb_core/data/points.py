@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,20 @@ class Points:
         return self.positions.shape[0]
 
 
+def is_colmap(path: str | Path) -> bool:
+    """Whether a file is named as COLMAP names its points."""
+    return Path(path).name in ("points3D.bin", "points3D.txt")
+
+
 def read_points(path: str | Path) -> Points:
-    """Finite points of a PLY file (or the corners of its mesh), grey where it has no colours. Raises ValueError for other files."""
+    """Finite points of a PLY file (or the corners of its mesh), grey where it has no colours, or of COLMAP's points3D.
+
+    Raises ValueError for other files.
+    """
+    if is_colmap(path):
+        from fb_core.data.colmap_reader import read_colmap_points  # which reads into our points
+
+        return read_colmap_points(Path(path))
     require_points(path)
     import trimesh
 
@@ -74,7 +87,9 @@ def _stored_colors(cloud: Any) -> Float[Tensor, "m 3"] | None:
 
 def require_points(path: str | Path) -> None:
     """Raises ValueError for a file that does not begin as a PLY file does, such as the pointer that Git LFS leaves in its place, and for
-    one whose header promises more than the file holds. Only the header is read."""
+    one whose header promises more than the file holds. Only the header is read. COLMAP's files are left to their reader."""
+    if is_colmap(path):
+        return
     with Path(path).open("rb") as file:
         start = file.read(_HEADER_BYTES)
     if not start.startswith(b"ply"):
@@ -87,6 +102,14 @@ def require_points(path: str | Path) -> None:
             raise ValueError(
                 f"points {path}: its header promises {int(count[:20]):,} of {what}, more than its {size:,} bytes hold; copy it again"
             )
+
+
+def copy_points(source: Path, target: Path) -> None:
+    """The same points as a PLY file: byte for byte where they are one already."""
+    if is_colmap(source):
+        write_points(target, read_points(source))
+    else:
+        shutil.copyfile(source, target)
 
 
 def write_points(path: str | Path, points: Points) -> None:

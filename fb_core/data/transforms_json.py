@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data import media
+from fb_core.data.undistort import FISHEYE_MODELS, PERSPECTIVE_MODELS
 from fb_core.geometry.cameras import Pinholes
 from fb_core.json_files import read_json
 from fb_core.limits import is_finite
@@ -25,6 +26,7 @@ INTRINSIC_KEYS = (
     *("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y"),
     *(*DISTORTION_KEYS, "camera_model", "is_fisheye"),
 )
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".exr")
 _BLANK = 64  # bytes of a file that may be nothing but white space
 _LAST_ROW_TOLERANCE = 1e-5  # what tools that compute in single precision leave of 0 0 0 1
 _ROTATION_TOLERANCE = 1e-3  # an error of that size moves a pixel by one at a focal of 1000
@@ -63,7 +65,7 @@ def camera_from(where: str, image_path: Path, entry: dict[str, Any], shared: dic
         if min(width, height) < 1 or width % 1 or height % 1:
             raise ValueError(f"{where}: expected w and h in whole pixels, at least 1, got {width:g} and {height:g}; correct the file")
     else:
-        height, width = media.image_size(image_path, apply_orientation=False)
+        height, width = media.posed_size(image_path)
     focal_x = _focal(where, values, "fl_x", "camera_angle_x", width)
     if focal_x is None:
         raise ValueError(f"{where}: intrinsics are missing, expected fl_x (pixels) or camera_angle_x (radians); process the pictures again")
@@ -88,6 +90,31 @@ def camera_entry(camera: Pinholes) -> dict[str, Any]:
     pose = [*to_opengl(camera.camera_to_world[0].double()).tolist(), [0.0, 0.0, 0.0, 1.0]]
     intrinsics = {"fl_x": focal_x, "fl_y": focal_y, "cx": center_x, "cy": center_y, "w": camera.width, "h": camera.height}
     return {**intrinsics, "transform_matrix": pose}
+
+
+def with_suffix(path: Path) -> Path:
+    """The file itself, or, for a name without a suffix as Blender's tools write it, the picture of that name."""
+    if path.suffix or path.exists():
+        return path
+    return next((named for suffix in _SUFFIXES if (named := path.with_name(path.name + suffix)).exists()), path)
+
+
+def listed_lens(where: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The same keys with nerfstudio's list of coefficients, if there is one, spread over k1, k2, k3, k4, p1, p2."""
+    listed = values.get("distortion_params")
+    if listed is None or values.get("camera_model", "OPENCV") not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS):
+        return values  # models that are not supported have lists of their own
+    if not isinstance(listed, list) or len(listed) != len(DISTORTION_KEYS):
+        raise ValueError(
+            f"{where}: expected distortion_params as six numbers k1, k2, k3, k4, p1, p2, got {str(listed)[:60]}; correct the file"
+        )
+    return {**values, **dict(zip(DISTORTION_KEYS, listed, strict=True))}
+
+
+def model_of(entry: dict[str, Any], shared: dict[str, Any]) -> str:
+    """The lens model's name; instant-ngp's ``is_fisheye`` says it, too."""
+    fisheye = shared.get("is_fisheye", entry.get("is_fisheye", False)) is True
+    return str(shared.get("camera_model", entry.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV")))
 
 
 def to_json(meta: dict[str, Any], where: str) -> str:
