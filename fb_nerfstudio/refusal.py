@@ -52,11 +52,12 @@ def refuse_bad_capture(config: Any) -> None:
         raise Refused(str(error)) from None
     if not capture.photos.frames:
         raise Refused(f"capture {capture.root}: all of its {len(capture)} frames are marked as generated; give a capture with photos")
-    scale = config.camera_res_scale_factor
+    scale, smaller = config.camera_res_scale_factor, config.dataparser.downscale_factor or 1
     for frame in capture.photos.frames:  # generated views keep their size
-        width, height = int(frame.camera.width * scale), int(frame.camera.height * scale)
+        width, height = (int(side // smaller * scale) for side in (frame.camera.width, frame.camera.height))
         if min(width, height) < SIDE_MULTIPLE:
-            scaled = "" if scale == 1 else f" after --pipeline.datamanager.camera-res-scale-factor {scale:g}"
+            options = {"--pipeline.datamanager.camera-res-scale-factor": scale, "--downscale-factor": smaller}
+            scaled = "".join(f" after {name} {value:g}" for name, value in options.items() if value != 1)
             raise Refused(
                 f"image {frame.image_path}: expected at least {SIDE_MULTIPLE} x {SIDE_MULTIPLE} pixels, got {width} x {height}{scaled}; "
                 "use larger pictures"

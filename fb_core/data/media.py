@@ -97,10 +97,12 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
     return (width, height) if apply_orientation and orientation in (5, 6, 7, 8) else (height, width)
 
 
-def fits_only_upright(path: str | Path, size: tuple[int, int]) -> bool:
+def fits_only_upright(path: str | Path, size: tuple[int, int], *, smaller_by: float = 1) -> bool:
     """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in stored pixels, unless
-    only the upright size fits. Headers alone are read."""
-    return image_size(path, apply_orientation=False) != size and image_size(path) == size
+    only the upright size fits. Headers alone are read. ``smaller_by``: the size is that of a copy, by this factor smaller than the file."""
+    stored, upright = (image_size(path, apply_orientation=turned) for turned in (False, True))
+    fits = [(int(height // smaller_by), int(width // smaller_by)) == tuple(size) for height, width in (stored, upright)]
+    return fits == [False, True]
 
 
 def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
