@@ -32,6 +32,7 @@ from fb_nerfstudio.completion import Inpainter, announcement, run_completion
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.exports import refuse_empty_exports
 from fb_nerfstudio.first_guess import first_guess
 from fb_nerfstudio.fitting_in import fitted_in, needed_by_splats
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
@@ -102,6 +103,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             )
         if test_mode == "val":  # a training; evaluation commands read what a training has already accepted
             refuse_bad_capture(config)
+        if test_mode == "inference":
+            refuse_empty_exports()
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._own_points: torch.Tensor | None = None
@@ -273,7 +276,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         if request is None:
             return
         try:
-            with self._at_work(), own_randomness(self.device, seed=self.config.completion.seed, step=step), self._unchanged_on_error(attributes):
+            with (
+                self._at_work(),
+                own_randomness(self.device, seed=self.config.completion.seed, step=step),
+                self._unchanged_on_error(attributes),
+            ):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"

@@ -117,7 +117,9 @@ def parsed(datamanager: Any) -> DataparserOutputs:
         outputs = without_open3d(parser).setup().get_dataparser_outputs(split="train")
     except (Exception, SystemExit) as error:  # whatever a dataparser of nerfstudio's raises
         told = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"data {data}: {type(parser).__name__} cannot read it ({told}); mend the data or the dataparser's options") from None
+        raise ValueError(
+            f"data {data}: {type(parser).__name__} cannot read it ({told}); mend the data or the dataparser's options"
+        ) from None
     if len(outputs.image_filenames) == 0:
         raise ValueError(f"data {data}: the dataparser's options leave no photo to train on; change the split")
     for path in [*outputs.image_filenames, *(outputs.mask_filenames or ())]:

@@ -6,9 +6,10 @@ Each is one sentence before the run has a folder; what is right goes on. The che
 from __future__ import annotations
 
 import copy
-import multiprocessing
+import os
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -275,23 +276,24 @@ def test_a_config_file_is_not_mixed_with_options_that_nerfstudio_ignores(
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
 
 
-def _claiming(folder: Path, claimed: Any, done: Any) -> None:
-    run_folder.claim(folder, goes_on_from=None, ours=False)
-    claimed.set()
-    done.wait(60)
+CLAIMING = """
+import pathlib, sys
+from fb_nerfstudio import run_folder
+run_folder.claim(pathlib.Path(sys.argv[1]), goes_on_from=None, ours=False)
+print("claimed", flush=True)
+sys.stdin.read()
+"""
 
 
 def test_two_runs_never_share_a_folder(tmp_path: Path):
     """While a run trains nobody else gets its folder, though it has no checkpoint yet; once it has ended, or was killed, it is free."""
-    context = multiprocessing.get_context("fork")
-    claimed, done = context.Event(), context.Event()
-    other = context.Process(target=_claiming, args=(tmp_path / "run", claimed, done))
-    other.start()
-    assert claimed.wait(60)
-    with pytest.raises(ValueError, match="another run trains there right now; give this one another --timestamp"):
-        run_folder.claim(tmp_path / "run", goes_on_from=None, ours=False)
-    other.kill()
-    other.join()
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", CLAIMING, str(tmp_path / "run")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as other:
+        assert other.stdout is not None and other.stdout.readline() == "claimed\n"
+        with pytest.raises(ValueError, match="another run trains there right now; give this one another --timestamp"):
+            run_folder.claim(tmp_path / "run", goes_on_from=None, ours=False)
+        other.kill()
     run_folder.claim(tmp_path / "run", goes_on_from=None, ours=False)
 
 
@@ -343,7 +345,9 @@ def test_a_second_datamanager_of_a_process_moves_what_the_first_moved(tiny_captu
         assert manager.exclude_batch_keys_from_device == []
 
 
-def test_a_split_that_leaves_nothing_and_data_of_another_format_are_one_sentence(tiny_capture: Path, model: Path, tmp_path: Path, only_starts):
+def test_a_split_that_leaves_nothing_and_data_of_another_format_are_one_sentence(
+    tiny_capture: Path, model: Path, tmp_path: Path, only_starts
+):
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
     config = config_for(tiny_capture, model, tmp_path / "out")

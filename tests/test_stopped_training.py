@@ -1,4 +1,4 @@
-"""Ctrl-C while ``ns-train`` trains and generates: no step is lost, and going on gives the bits of a run that nobody disturbed (on a CPU)."""
+"""Ctrl-C while ``ns-train`` trains and generates: no step is lost, and going on gives the bits of an undisturbed run (on a CPU)."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def config_of(inputs: tuple[Path, Path], output: Path, timestamp: str) -> Any:
     config: Any = toy_config(inputs[0], output, inputs[1], timestamp)
+    config.experiment_name = inputs[0].name
     config.max_num_iterations, config.steps_per_save, config.steps_per_eval_image = STEPS, 10**6, 2
     completion = config.pipeline.datamanager.completion
     completion.at_step, completion.steps, completion.trust = AT_STEP, 1, "full"
