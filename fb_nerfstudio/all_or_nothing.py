@@ -34,8 +34,9 @@ def _kept(splats: Any, optimizers: Any) -> Any:
     if gaussians is None:
         return lambda: None
     parameters, counted, info = dict(gaussians.items()), dict(splats.strategy_state), splats.info
-    groups = {} if optimizers is None else {name: list(values) for name, values in optimizers.parameters.items()}
-    moments = {} if optimizers is None else {name: _moments(optimizer) for name, optimizer in optimizers.optimizers.items()}
+    trainers: Any = optimizers
+    groups = {} if trainers is None else {name: list(values) for name, values in trainers.parameters.items()}
+    moments = {} if trainers is None else {name: _moments(optimizer) for name, optimizer in trainers.optimizers.items()}
 
     def put_back() -> None:
         for name, values in parameters.items():
@@ -44,9 +45,9 @@ def _kept(splats: Any, optimizers: Any) -> Any:
         splats.strategy_state.update(counted)
         splats.info = info
         for name, values in groups.items():
-            optimizers.parameters[name] = values
+            trainers.parameters[name] = values
         for name, (state, trained) in moments.items():
-            optimizer = optimizers.optimizers[name]
+            optimizer = trainers.optimizers[name]
             optimizer.state.clear()
             optimizer.state.update({parameter: dict(values) for parameter, values in state.items()})
             for group, values in zip(optimizer.param_groups, trained, strict=True):

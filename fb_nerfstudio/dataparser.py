@@ -199,8 +199,8 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
 
     def _made_smaller(self, files: list[Path], full: list[Path]) -> dict[str, list[float]]:
         """By what factor each picture is to be read smaller; nothing where all smaller copies that were asked for are there."""
-        factor = self.downscale_factor or 1
-        factors = [factor if file == whole else 1 for file, whole in zip(files, full, strict=True)]
+        factor = float(self.downscale_factor or 1)
+        factors = [factor if file == whole else 1.0 for file, whole in zip(files, full, strict=True)]
         return {SMALLER_BY: factors} if any(one > 1 for one in factors) else {}
 
     @staticmethod

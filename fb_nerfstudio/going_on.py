@@ -115,7 +115,7 @@ def parsed(datamanager: Any) -> DataparserOutputs:
         parser.load_3D_points = False
     try:
         outputs = without_open3d(parser).setup().get_dataparser_outputs(split="train")
-    except (Exception, SystemExit) as error:  # whatever a dataparser of nerfstudio's raises
+    except Exception as error:  # whatever a dataparser of nerfstudio's raises
         told = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError(
             f"data {data}: {type(parser).__name__} cannot read it ({told}); mend the data or the dataparser's options"

@@ -9,6 +9,7 @@ import copy
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -356,6 +357,21 @@ def test_a_split_that_leaves_nothing_and_data_of_another_format_are_one_sentence
     config = config_for(tiny_capture, model, tmp_path / "out")
     config.timestamp, config.pipeline.datamanager.dataparser.eval_mode = "run", "filename"
     assert re.search("cannot read it|leave no photo", refusal(config))
+
+
+def test_ctrl_c_while_the_capture_is_read_is_no_bad_capture(tiny_capture: Path, model: Path, tmp_path: Path, monkeypatch, capsys):
+    from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.setattr(NerfstudioWithoutOpen3d, "_generate_dataparser_outputs", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            ns_train.main(config_for(tiny_capture, model, tmp_path / "out"))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert stopped.value.code == 130 and capsys.readouterr().err == "\nStopped; nothing was saved yet.\n"
+    assert not (tmp_path / "out").exists()
 
 
 def test_too_small_pictures_name_the_option(tiny_capture: Path, model: Path, tmp_path: Path, only_starts):
