@@ -25,8 +25,8 @@ def raise_interrupt(number: int) -> NoReturn:
     raise SystemExit(128 + number)
 
 
-def stop_on_signals(stop: Callable[[int], NoReturn] = raise_interrupt) -> None:
-    """From now on ``stop(number)``, which raises, is called in the main thread for SIGINT and SIGTERM.
+def stop_on_signals(stop: Callable[[int], object] = raise_interrupt) -> None:
+    """From now on ``stop(number)``, which raises or notes it, is called in the main thread for SIGINT and SIGTERM.
 
     A signal that comes during an import waits for the end of it, and one whose error was lost in a place from where Python
     cannot raise (a destructor, a callback of C code) comes again. Outside the main thread Python sets no handlers, nor does this.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -21,6 +23,7 @@ from fb_core.files.whole import remove_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_core.networks.precision import in_words
+from fb_nerfstudio.all_or_nothing import undone_on_error
 from fb_nerfstudio.bank import Bank, without_requested
 from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
 from fb_nerfstudio.captured_views import CapturedViewsDatamanager
@@ -29,9 +32,11 @@ from fb_nerfstudio.completion import Inpainter, announcement, open_cache, run_co
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.exports import refuse_empty_exports
 from fb_nerfstudio.first_guess import first_guess
 from fb_nerfstudio.fitting_in import fitted_in, needed_by_splats
 from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
+from fb_nerfstudio.going_on import CaptureIdentity
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
@@ -98,6 +103,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             )
         if test_mode == "val":  # a training; evaluation commands read what a training has already accepted
             refuse_bad_capture(config)
+        if test_mode == "inference":
+            refuse_empty_exports()
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._own_points: torch.Tensor | None = None
@@ -109,6 +116,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._finished = False
         self._trust: float | None = None  # in the model on this capture, once it is measured
         self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
+        self._given_up: set[int] = set()  # those of them that could not be generated
+        self.at_work = False
 
     def _find_start_points(self) -> None:
         """Give the pipeline points to start the splats from, where the capture brings none."""
@@ -175,7 +184,10 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         completion = self.config.completion
         if not completion.enabled or self._finished or step < completion.at_step:
             return
-        with own_randomness(self.device, seed=completion.seed, step=step):
+        keep = getattr(attributes.trainer, "keep_what_is_trained", None)
+        if keep is not None:
+            keep()  # a generation may take long, or fail
+        with self._at_work(), own_randomness(self.device, seed=completion.seed, step=step):
             self._complete(attributes, step)
 
     def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
@@ -257,21 +269,56 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             CONSOLE.print(f"{len(done)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
 
     def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
-        """Do what was asked for in the viewer, one request before each iteration. What cannot be done is said there; training goes on."""
-        request = self.completion_panel.requests.take() or self._next_outdated()
+        """Do what was asked for in the viewer, one request before each iteration, whole or not at all.
+
+        What cannot be done is said there; training goes on.
+        """
+        asked = self.completion_panel.requests.take()
+        request = asked or self._next_outdated()
         if request is None:
             return
-        if isinstance(request, RegenerateRound):
-            self._outdated = [number for number in self._outdated if number != request.number]
         try:
-            with own_randomness(self.device, seed=self.config.completion.seed, step=step):
+            with (
+                self._at_work(),
+                own_randomness(self.device, seed=self.config.completion.seed, step=step),
+                self._unchanged_on_error(attributes),
+            ):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
-            _logger.debug("request %s", request, exc_info=True)
+            _logger.warning("Not done: %s: %s", request, error, exc_info=None if isinstance(error, ValueError) else error)
+            if asked is None and isinstance(request, RegenerateRound):  # it stays outdated, but is not tried before every iteration
+                self._given_up.add(request.number)
+                _logger.warning("Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number)
         release_memory()
         CONSOLE.print(said)
         self.completion_panel.report(said)
+
+    @contextmanager
+    def _at_work(self) -> Iterator[None]:
+        """Meanwhile Ctrl-C ends the training at once, and not after the iteration: views are generated."""
+        self.at_work = True
+        try:
+            yield
+        finally:
+            self.at_work = False
+
+    @contextmanager
+    def _unchanged_on_error(self, attributes: TrainingCallbackAttributes) -> Iterator[None]:
+        """Bank, Gaussians and what is outdated are as they were where the block ends with an error, in the run's folder too."""
+        views, bank, outdated = self.generated_views, self._bank, list(self._outdated)
+        try:
+            with undone_on_error(splats_of(attributes), attributes.optimizers):
+                yield
+        except BaseException:
+            changed, self._bank, self._outdated = self._bank is not bank, bank, outdated
+            if changed:
+                try:
+                    self.completion_panel.show(views)
+                    self._save_bank(attributes.trainer)
+                except Exception:  # of drawing or of the disk: the checkpoint has the views
+                    _logger.warning("The run's folder or the viewer may show views that were given up again", exc_info=True)
+            raise
 
     def _serve(self, request: Request, attributes: TrainingCallbackAttributes, step: int) -> str:
         """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises ValueError."""
@@ -287,8 +334,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         """A round that stands on anchors which are no more, to be generated as it was, from the new ones."""
         there = [] if self.generated_views is None else self.generated_views.rounds
         self._outdated = [number for number in self._outdated if number in there]
-        waits = self.config.completion.enabled and self._outdated
-        return RegenerateRound(number=self._outdated[0], seed=None) if waits else None
+        waiting = [number for number in self._outdated if number not in self._given_up]
+        return RegenerateRound(number=waiting[0], seed=None) if self.config.completion.enabled and waiting else None
 
     def _remove(self, request: RemoveView, attributes: TrainingCallbackAttributes) -> str:
         before, place = self.generated_views, place_of(self.generated_views, request.key)
@@ -326,8 +373,10 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
         said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
-        if isinstance(request, RegenerateRound) and request.seed is not None:
-            self._outdated = sorted({*self._outdated, *standing_on(self.generated_views, request.number)})
+        if isinstance(request, RegenerateRound):
+            followers = [] if request.seed is None else standing_on(self.generated_views, request.number)
+            self._outdated = sorted({*self._outdated, *followers} - {request.number})
+            self._given_up -= {request.number, *followers}
         follow = f" To be generated anew from the new anchors: {len(self._outdated)} rounds." if self._outdated else ""
         return f"{said}{added} Gaussians placed in holes.{follow}"
 
@@ -412,6 +461,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             "trust": self._trust,
             "start_points": self._own_points,
             "captured_draws": self.captured_draws,
+            "capture": CaptureIdentity.of(self.train_dataparser_outputs).state(),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

@@ -33,6 +33,7 @@ from fb_core.data.points import read_points
 from fb_core.data.transforms_json import DISTORTION_KEYS
 from fb_core.data.undistort import FISHEYE_MODELS
 from fb_nerfstudio.bridge import flip_axes
+from fb_nerfstudio.pictures import SMALLER_BY
 
 _ONE_PLACE = 1e-6  # of the largest coordinate, in single precision: what it cannot tell apart
 _FAR_OFF = 1000.0  # spreads from the origin: beyond, single precision rounds poses by more than a ten thousandth of the spread
@@ -104,6 +105,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
                 "depth_filenames": self._depths(frames, chosen, capture),
                 "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
                 "mask_color": self.config.mask_color,
+                **self._made_smaller(files, [frames[place].image_path for place in chosen], capture),
                 **points,
             },
         )
@@ -194,11 +196,20 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         return self.downscale_factor is not None and self.downscale_factor > capture.reduced
 
     def _file(self, path: Path, capture: Capture, prefix: str) -> Path:
-        """The picture, or its smaller copy."""
+        """The picture, or its smaller copy; where there is no such copy the picture itself, which is made small when it is read
+        (`fb_nerfstudio.pictures`), as a mask is with its picture."""
         if not self._takes_copies(capture):
             return path
         copy = smaller_copy(path, capture, prefix, self.downscale_factor or 1)
-        return path if prefix == "masks_" and not copy.exists() else copy  # a mask of full size is made small with its picture
+        return copy if copy.exists() else path
+
+    def _made_smaller(self, files: list[Path], full: list[Path], capture: Capture) -> dict[str, list[float]]:
+        """By what factor each picture is to be read smaller; nothing where all smaller copies that were asked for are there."""
+        if not self._takes_copies(capture):
+            return {}
+        factor = (self.downscale_factor or 1) / capture.reduced
+        factors = [factor if file == whole else 1.0 for file, whole in zip(files, full, strict=True)]
+        return {SMALLER_BY: factors} if any(one > 1 for one in factors) else {}
 
     @staticmethod
     def _automatic_factor(path: Path, capture: Capture) -> int:

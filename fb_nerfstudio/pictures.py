@@ -16,19 +16,31 @@ from PIL import Image
 
 from fb_core.data import media
 
+SMALLER_BY = "pictures_smaller_by"
+"""In a dataparser's metadata: of each picture the factor by which it is to be read smaller."""
+
 
 class CapturePictures(InputDataset):
-    """Pictures of 8 bits (RGB, or RGBA where the file has alpha) and masks of a capture, scaled as nerfstudio scales them."""
+    """Pictures of 8 bits (RGB, or RGBA where the file has alpha) and masks of a capture, scaled as nerfstudio scales them.
+
+    Smaller copies that were asked for and are not there are made in memory.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # nerfstudio takes names out of this list; its own is shared by all datasets of a process
+        self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """[h, w, 3 or 4] of the camera's size. Raises ValueError in one sentence for a file that cannot be read."""
         path = self._dataparser_outputs.image_filenames[image_idx]
         pixels, alpha = media.read_photo(path, apply_orientation=self._turned(image_idx))
         channels = pixels if alpha is None else torch.cat([pixels, alpha])
-        picture = Image.fromarray((channels * 255).round().to(torch.uint8).movedim(0, -1).numpy())
-        if self.scale_factor != 1.0:
-            size = (int(picture.width * self.scale_factor), int(picture.height * self.scale_factor))
-            picture = picture.resize(size, resample=Image.Resampling.BILINEAR)
+        picture = Image.fromarray((channels.clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).numpy())
+        smaller = self._smaller_by(image_idx)
+        if self.scale_factor != 1.0 or smaller != 1:
+            width, height = (int(side // smaller * self.scale_factor) for side in picture.size)
+            picture = picture.resize((width, height), resample=Image.Resampling.BILINEAR)
         return np.array(picture, dtype=np.uint8)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
@@ -53,4 +65,10 @@ class CapturePictures(InputDataset):
     def _turned(self, image_idx: int) -> bool:
         """Whether picture and mask are turned as the picture's EXIF tag says."""
         camera = self._dataparser_outputs.cameras[image_idx]
-        return media.fits_only_upright(self._dataparser_outputs.image_filenames[image_idx], (int(camera.height), int(camera.width)))
+        size = int(camera.height), int(camera.width)
+        return media.fits_only_upright(self._dataparser_outputs.image_filenames[image_idx], size, smaller_by=self._smaller_by(image_idx))
+
+    def _smaller_by(self, image_idx: int) -> float:
+        """The factor by which a picture of full size is read smaller; 1 for a copy that is small already."""
+        factors = self.metadata.get(SMALLER_BY)
+        return 1 if factors is None else factors[image_idx]

@@ -17,7 +17,6 @@ from fb_core.data.captures import Capture, Frame, validate_capture
 from fb_core.files.faults import CannotWrite, is_of_the_disk
 from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
 from fb_nerfstudio.completion_config import CompletionConfig
-from fb_nerfstudio.dataparser import smaller_copy
 from fb_nerfstudio.grid_inpainter import check_weights
 
 
@@ -53,12 +52,13 @@ def refuse_bad_capture(config: Any) -> None:
         raise Refused(str(error)) from None
     if not capture.photos.frames:
         raise Refused(f"capture {capture.root}: all of its {len(capture)} frames are marked as generated; give a capture with photos")
-    _refuse_missing_copies(capture.photos, config.dataparser.downscale_factor)
-    scale = config.camera_res_scale_factor
+    scale, smaller = config.camera_res_scale_factor, (config.dataparser.downscale_factor or 1) / capture.photos.reduced
+    smaller = max(smaller, 1)
     for frame in capture.photos.frames:  # generated views keep their size
-        width, height = int(frame.camera.width * scale), int(frame.camera.height * scale)
+        width, height = (int(side // smaller * scale) for side in (frame.camera.width, frame.camera.height))
         if min(width, height) < SIDE_MULTIPLE:
-            scaled = "" if scale == 1 else f" after --pipeline.datamanager.camera-res-scale-factor {scale:g}"
+            options = {"--pipeline.datamanager.camera-res-scale-factor": scale, "--downscale-factor": smaller}
+            scaled = "".join(f" after {name} {value:g}" for name, value in options.items() if value != 1)
             raise Refused(
                 f"image {frame.image_path}: expected at least {SIDE_MULTIPLE} x {SIDE_MULTIPLE} pixels, got {width} x {height}{scaled}; "
                 "use larger pictures"
@@ -67,19 +67,6 @@ def refuse_bad_capture(config: Any) -> None:
         _refuse_masks(capture.photos, config.completion)
     except ValueError as error:
         raise Refused(str(error)) from None
-
-
-def _refuse_missing_copies(capture: Capture, factor: int | None) -> None:
-    """Raises Refused where smaller copies are asked for that are not there."""
-    if factor is None or factor <= capture.reduced:
-        return
-    for frame in capture.frames:
-        copy = smaller_copy(frame.image_path, capture, "images_", factor)
-        if not copy.is_file():
-            raise Refused(
-                f"nerfstudio-data --downscale-factor {factor}: expected the picture {copy}, which is missing; make the smaller copies, or "
-                "use --pipeline.datamanager.camera-res-scale-factor, which needs none"
-            )
 
 
 def _refuse_masks(capture: Capture, completion: CompletionConfig) -> None:

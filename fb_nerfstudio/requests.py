@@ -84,12 +84,14 @@ class RequestQueue:
         self._closed: str | None = closed
 
     def __len__(self) -> int:
-        return len(self._waiting)
+        with self._lock:
+            return len(self._waiting)
 
     @property
     def closed(self) -> str | None:
         """The sentence that says why nothing is taken any more; None while requests are."""
-        return self._closed
+        with self._lock:
+            return self._closed
 
     def open(self) -> None:
         """The training takes requests from now on."""
@@ -115,8 +117,6 @@ class RequestQueue:
 
     def take(self) -> Request | None:
         """The request that has waited longest, None when there is none."""
-        if not self._waiting:  # the usual answer, without a lock: the training asks before every iteration
-            return None
         with self._lock:
             return self._waiting.popleft() if self._waiting else None
 

@@ -12,6 +12,7 @@ import torch
 from gsplat.strategy.ops import remove
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, color_correct, total_variation_loss
@@ -29,6 +30,7 @@ from fb_nerfstudio.gaussians import evenly_chosen, gaussians_at, random_points
 from fb_nerfstudio.lazy_lpips import LazyLpips
 from fb_nerfstudio.mcmc import CappedMCMC, penalize
 from fb_nerfstudio.normal_losses import alignment_loss, blended_normals, gaussian_normals, total_variation
+from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.splat_backend import render_splats
 from fb_nerfstudio.torch_spherical_harmonics import sh_colors
 
@@ -270,6 +272,10 @@ class FillerbusterSplatModel(SplatfactoModel):
 
     def _pinhole(self, camera: Cameras) -> Pinholes:
         """The camera with the optimizer's correction, at the resolution of this stage of training."""
+        if isinstance(camera, RayBundle):
+            raise Refused(
+                "splats are drawn picture by picture and answer no single rays; ns-export has gaussian-splat and cameras for them"
+            )
         if not isinstance(camera, Cameras) or camera.camera_to_worlds.numel() != 12:
             got = f"{camera.camera_to_worlds.numel() // 12} cameras" if isinstance(camera, Cameras) else type(camera).__name__
             raise ValueError(f"camera: expected one nerfstudio camera, got {got}; render cameras one by one")

@@ -56,7 +56,7 @@ class CompletionPanel(ViewerControl):
         self._drawn: dict[str, tuple] = {}
         self._hidden: set[str] = set()
         self._rounds: dict[str, int] = {}
-        self._lock = threading.RLock()  # the training draws, clicks select
+        self._lock = threading.RLock()  # of all that is said, drawn and selected here: the training draws, clicks select
         self._selected: str | None = None
         self._marker: Any = None
 
@@ -70,30 +70,33 @@ class CompletionPanel(ViewerControl):
         gui = self.viser_server.gui
         # Between the viewer's numbers and its tabs, so that it is seen without scrolling.
         order = viewer.stats_markdown.order + 0.5 if hasattr(viewer, "stats_markdown") else None
-        self._folder = gui.add_folder("Completion", order=order)
-        self._groups, self._switches, self._drawn = {}, {}, {}
-        with self._folder:
-            self._status = gui.add_markdown("", order=0)
-            self._progress = gui.add_progress_bar(0.0, visible=False, order=1)
-            self._add_buttons(gui)
-        self._add_switch("captured", f"Captured ({self.captured})", self._show_captured)
-        self._draw()
+        with self._lock:
+            self._folder = gui.add_folder("Completion", order=order)
+            self._groups, self._switches, self._drawn = {}, {}, {}
+            with self._folder:
+                self._status = gui.add_markdown("", order=0)
+                self._progress = gui.add_progress_bar(0.0, visible=False, order=1)
+                self._add_buttons(gui)
+            self._add_switch("captured", f"Captured ({self.captured})", self._show_captured)
+            self._draw()
 
     # ------------------------------------------------------------------------------------ what the training has to say
 
     def show(self, views: CompletedViews | None) -> None:
         """Draw these generated views instead of the earlier ones."""
-        self.views = views
-        self._draw()
+        with self._lock:
+            self.views = views
+            self._draw()
 
     def report(self, message: str, share: float | None = None) -> None:
         """A line of text in the panel, and how far a running generation is (0 to 1; None when nothing runs)."""
-        self._message = message
-        if self._progress is not None:
-            self._progress.visible = share is not None
-            if share is not None:
-                self._progress.value = 100.0 * share
-        self._write_status()
+        with self._lock:
+            self._message = message
+            if self._progress is not None:
+                self._progress.visible = share is not None
+                if share is not None:
+                    self._progress.value = 100.0 * share
+            self._write_status()
 
     def training_begins(self, *, takes_requests: bool = True) -> None:
         """From now on requests are taken, unless the run trains without new views."""
@@ -114,9 +117,9 @@ class CompletionPanel(ViewerControl):
         """Bring frustums and switches up to date; rounds that are as they were stay untouched."""
         if not self.is_open:
             return
-        rounds = {} if self.views is None else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
-        told = {name: _told(views) for name, views in rounds.items()}
         with self._lock:
+            rounds = {} if self.views is None else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
+            told = {name: _told(views) for name, views in rounds.items()}
             for name in [name for name in self._drawn if self._drawn[name] != told.get(name)]:
                 self._clear_round(name)
             for name, views in rounds.items():
@@ -141,8 +144,9 @@ class CompletionPanel(ViewerControl):
         self._groups[name] = [group, *(self._draw_view(f"{node}/view_{index:03d}", views, index) for index in range(len(views)))]
 
         def show(visible: bool) -> None:
-            (self._hidden.discard if visible else self._hidden.add)(name)
-            group.visible = visible
+            with self._lock:
+                (self._hidden.discard if visible else self._hidden.add)(name)
+                group.visible = visible
 
         self._add_switch(name, _label(views), show, order=3 + views.origins[0].round)
 
@@ -154,7 +158,8 @@ class CompletionPanel(ViewerControl):
 
         @handle.on_click
         def _(_: Any) -> None:
-            self._select(None if key == self._selected else key)
+            with self._lock:
+                self._select(None if key == self._selected else key)
 
         return handle
 
@@ -188,20 +193,17 @@ class CompletionPanel(ViewerControl):
             self.viewer.set_camera_visibility(visible)
 
     def _write_status(self) -> None:
-        if self._status is None:
-            return
-        count = 0 if self.views is None else len(self.views)
-        lines = [
-            views_in_words(count, "generated ") if count else "No generated views",
-            self.requests.closed,
-            self._message,
-        ]
-        self._status.content = "  \n".join(line for line in lines if line)
-        for element in self._asking.values():
-            element.disabled = self.requests.closed is not None
-        for name in ("look", "remove"):
-            if name in self._asking:
-                self._asking[name].disabled = self._selected is None or (name == "remove" and self.requests.closed is not None)
+        with self._lock:
+            if self._status is None:
+                return
+            count, closed = 0 if self.views is None else len(self.views), self.requests.closed
+            lines = [views_in_words(count, "generated ") if count else "No generated views", closed, self._message]
+            self._status.content = "  \n".join(line for line in lines if line)
+            for element in self._asking.values():
+                element.disabled = closed is not None
+            for name in ("look", "remove"):
+                if name in self._asking:
+                    self._asking[name].disabled = self._selected is None or (name == "remove" and closed is not None)
 
     # ---------------------------------------------------------------------------------------------------------- asking
 
@@ -232,29 +234,32 @@ class CompletionPanel(ViewerControl):
             self._asking["round"].options = options or (_NO_ROUND,)
 
     def _complete_clicked(self, event: Any) -> None:
-        views = int(self._asking["views"].value)
+        views, pose = int(self._asking["views"].value), pose_of(event.client.camera)
         self._ask(
             f"{views_in_words(views)} from here",
-            lambda seed, prompt: CompleteFrom(camera_to_world=pose_of(event.client.camera), views=views, seed=seed, prompt=prompt),
+            lambda seed, prompt: CompleteFrom(camera_to_world=pose, views=views, seed=seed, prompt=prompt),
         )
 
     def _regenerate_clicked(self, _: Any) -> None:
-        label = self._asking["round"].value
-        if label not in self._rounds:
+        with self._lock:
+            label = self._asking["round"].value
+            number = self._rounds.get(label)
+        if number is None:
             self.report("There is no round to generate anew.")
             return
-        number = self._rounds[label]
         self._ask(f"{label} anew", lambda seed, prompt: RegenerateRound(number=number, seed=seed, prompt=prompt))
 
     def _remove_clicked(self, _: Any) -> None:
-        key = self._selected
+        with self._lock:
+            key = self._selected
         if key is not None:
             self._ask("one view fewer", lambda seed, prompt: RemoveView(key=key), counts=False)
 
     def _look_clicked(self, event: Any) -> None:
-        place = place_of(self.views, self._selected or "")
-        if self.views is not None and place is not None:
-            self._look_from(event.client, self.views, place)
+        with self._lock:
+            views, place = self.views, place_of(self.views, self._selected or "")
+        if views is not None and place is not None:
+            self._look_from(event.client, views, place)
 
     def _look_from(self, client: Any, views: CompletedViews, index: int) -> None:
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
@@ -267,19 +272,19 @@ class CompletionPanel(ViewerControl):
 
     def _ask(self, what: str, request: Callable[[int, str], Request], *, counts: bool = True) -> None:
         """Put a request into the queue, and say that it waits or why it cannot be."""
-        seed, prompt = int(self._asking["seed"].value), self._asking["prompt"].value.strip()
-        try:
-            self.requests.put(request(seed, prompt))
-        except ValueError as error:
-            self.report(str(error))
-            return
-        if counts:
-            self._asking["seed"].value = seed + 1
-        paused = getattr(getattr(self.viewer, "trainer", None), "training_state", "") == "paused"
-        self._message = f"Asked for: {what}. " + (
-            "Training is paused; it begins when you resume." if paused else "Waiting for the training."
-        )
-        self._write_status()
+        with self._lock:  # two clicks at a time have a seed each
+            seed, prompt = int(self._asking["seed"].value), self._asking["prompt"].value.strip()
+            try:
+                self.requests.put(request(seed, prompt))
+            except ValueError as error:
+                self.report(str(error))
+                return
+            if counts:
+                self._asking["seed"].value = seed + 1
+            paused = getattr(getattr(self.viewer, "trainer", None), "training_state", "") == "paused"
+            waits = "Training is paused; it begins when you resume." if paused else "Waiting for the training."
+            self._message = f"Asked for: {what}. {waits}"
+            self._write_status()
 
     def _select(self, key: str | None) -> None:
         """Mark the frustum of a view and offer to remove it; None marks none."""

@@ -33,6 +33,7 @@ from fb_core.data.room_captures import rooms
 from fb_core.inpainter import Fillerbuster
 from fb_nerfstudio import datamanager as datamanager_module
 from fb_nerfstudio.datamanager import FillerbusterDataManager
+from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.run_config import read_run_config
 from fb_nerfstudio.splat_model import FillerbusterSplatModel
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
@@ -252,6 +253,21 @@ def test_ns_export_gaussian_splat(chain: Chain, tmp_path: Path):
     ExportGaussianSplat(load_config=chain.config_file, output_dir=tmp_path).main()
     header = (tmp_path / "splat.ply").read_bytes().split(b"end_header")[0].decode()
     assert f"element vertex {chain.trainer.pipeline.model.num_points}" in header
+
+
+@needs_libusb
+def test_ns_export_of_nothing_and_of_rays_is_one_sentence(chain: Chain, tmp_path: Path):
+    """An empty box; and the exports that ask a model for single rays, which no splats answer."""
+    from nerfstudio.scripts import exporter
+
+    far = exporter.ExportGaussianSplat(
+        load_config=chain.config_file, output_dir=tmp_path, obb_center=(99, 99, 99), obb_rotation=(0, 0, 0), obb_scale=(1, 1, 1)
+    )
+    with pytest.raises(Refused, match="no Gaussian is left to write; choose a larger box"):
+        far.main()
+    with pytest.raises(Refused, match="answer no single rays; ns-export has gaussian-splat"):
+        exporter.ExportPointCloud(load_config=chain.config_file, output_dir=tmp_path, num_points=10).main()
+    assert not list(tmp_path.iterdir())
 
 
 def test_ns_viewer_shows_the_generated_views(chain: Chain, monkeypatch: pytest.MonkeyPatch):

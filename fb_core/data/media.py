@@ -137,12 +137,15 @@ def posed_size(path: str | Path) -> tuple[int, int]:
     return image_size(path, apply_orientation=Path(path).suffix.lower() in TIFF_SUFFIXES)
 
 
-def fits_only_upright(path: str | Path, size: tuple[int, int]) -> bool:
+def fits_only_upright(path: str | Path, size: tuple[int, int], *, smaller_by: float = 1) -> bool:
     """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in stored pixels, unless
-    only the upright size fits; TIFF files the other way round. Headers alone are read."""
+    only the upright size fits; TIFF files the other way round. Headers alone are read. ``smaller_by``: the size is that of a copy, by this
+    factor smaller than the file."""
+    sizes = (image_size(path, apply_orientation=turned) for turned in (False, True))
+    as_stored, as_upright = ((int(height // smaller_by), int(width // smaller_by)) == tuple(size) for height, width in sizes)
     if Path(path).suffix.lower() in TIFF_SUFFIXES:
-        return image_size(path) == size or image_size(path, apply_orientation=False) != size
-    return image_size(path, apply_orientation=False) != size and image_size(path) == size
+        return as_upright or not as_stored
+    return as_upright and not as_stored
 
 
 def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
