@@ -119,10 +119,11 @@ def test_whatever_stands_in_the_files_is_no_error(tmp_path: Path):
     words += ["22 1 0:2 / /sys/fs/cgroup rw - cgroup2 c rw", "3 2 0:2 /a /sys/fs/cgroup rw - cgroup c rw,memory", "/..", "inactive_file"]
     groups = ("memory.max", "memory.current", "memory.stat", "memory.limit_in_bytes", "memory.usage_in_bytes")
     names = ["proc/meminfo", "proc/self/cgroup", "proc/self/mountinfo", *(f"sys/fs/cgroup/{name}" for name in groups)]
-    for _ in range(300):
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    for _ in range(100):
         for name in names:
             lines = ["".join(draws.choice(words) + draws.choice(("", " ", ":")) for _ in range(draws.randint(0, 4))) for _ in range(3)]
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_text("\n".join(lines))
         free = machine.free_memory_bytes(tmp_path)
         assert free is None or free >= 0
