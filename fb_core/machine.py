@@ -13,6 +13,7 @@ from pathlib import Path
 
 _UNLIMITED = 2**62  # version 1 writes its largest number for "no limit"
 _KIB = 1024
+_MOST_DIGITS = 40  # of a number of bytes
 
 
 def free_memory_bytes(root: Path = Path("/")) -> int | None:
@@ -47,8 +48,10 @@ def peak_memory_bytes() -> int:
 def _machine_free(root: Path) -> int | None:
     """Of the whole machine: Linux's own estimate, elsewhere psutil's if it is installed."""
     for line in _text(root / "proc/meminfo").splitlines():
-        if line.startswith("MemAvailable:"):
-            return _KIB * int(line.split()[1])
+        name, _, told = line.partition(":")
+        available = _whole(told.split()[0]) if name == "MemAvailable" and told.split() else None
+        if available is not None:
+            return _KIB * available
     try:
         import psutil
     except ImportError:
@@ -60,13 +63,16 @@ def _groups(root: Path) -> Iterator[Path]:
     """Folders of the control groups that limit this process's memory, the innermost first, of each version that is mounted."""
     paths = dict[str, str]()  # of this process, by the list of controllers; "" is version 2
     for line in _text(root / "proc/self/cgroup").splitlines():
-        _, controllers, path = line.split(":", 2)
+        _, _, told = line.partition(":")
+        controllers, _, path = told.partition(":")
         paths |= {name: path for name in controllers.split(",")}
     for line in _text(root / "proc/self/mountinfo").splitlines():
         fields, _, rest = line.partition(" - ")
-        kind, options = rest.split()[0], rest.split()[-1].split(",")
+        words, places = rest.split(), fields.split()[3:5]
+        if len(words) < 3 or len(places) < 2:
+            continue  # not as Linux writes it: a sandbox that only plays its part
+        kind, options, (inside, mount) = words[0], words[-1].split(","), places
         if kind == "cgroup2" or (kind == "cgroup" and "memory" in options):
-            inside, mount = fields.split()[3:5]
             yield from _upwards(root / mount.lstrip("/"), inside, paths.get("" if kind == "cgroup2" else "memory", "/"))
 
 
@@ -87,20 +93,26 @@ def _rooms(group: Path) -> Iterator[int]:
         ("memory.usage_in_bytes", ("memory.limit_in_bytes",), "total_inactive_file"),
     ):
         used = _number(group / current)
-        for limit in map(_number, (group / name for name in limits)):
+        above = _stat(group, "hierarchical_memory_limit", _UNLIMITED)  # version 1: the least of all around it, seen by the mount or not
+        for limit in (above, *map(_number, (group / name for name in limits))):
             if used is not None and limit is not None and limit < _UNLIMITED:
                 yield limit - max(0, used - _stat(group, idle))
 
 
-def _stat(group: Path, name: str) -> int:
+def _stat(group: Path, name: str, without: int = 0) -> int:
+    """A value of the group's statistics; `without` where they do not have it."""
     lines = (line.split() for line in _text(group / "memory.stat").splitlines())
-    return next((int(words[1]) for words in lines if len(words) == 2 and words[0] == name), 0)
+    found = next((_whole(words[1]) for words in lines if len(words) == 2 and words[0] == name), None)
+    return without if found is None else found
 
 
 def _number(path: Path) -> int | None:
     """A file's only number; None for "max" and for a file that is not there."""
-    text = _text(path).strip()
-    return int(text) if text.isdecimal() else None
+    return _whole(_text(path).strip())
+
+
+def _whole(text: str) -> int | None:
+    return int(text) if text.isdecimal() and len(text) < _MOST_DIGITS else None
 
 
 def _text(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import resource
 import sys
 from pathlib import Path
@@ -96,6 +97,36 @@ def test_version_1_of_a_batch_job(tmp_path: Path):
     linux.v1("sys/fs/cgroup/memory/slurm/uid_7/job_9", top=4, used=1)
     linux.v1("sys/fs/cgroup/memory", used=60)
     assert linux.free_gib == 3
+
+
+def test_version_1_tells_of_groups_that_the_mount_does_not_show(tmp_path: Path):
+    """A pod's limit: the container's own group has none, and its mount shows no other."""
+    mounts = "31 22 0:27 /kubepods/pod7/abc /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n"
+    linux = Linux(tmp_path, group="5:memory:/kubepods/pod7/abc\n", mounts=mounts)
+    linux.v1("sys/fs/cgroup/memory", used=1)
+    assert linux.free_gib == 40
+    stat = tmp_path / "sys/fs/cgroup/memory/memory.stat"
+    stat.write_text(stat.read_text() + f"hierarchical_memory_limit {6 * GIB}\nhierarchical_memsw_limit {UNLIMITED_V1}\n")
+    assert linux.free_gib == 5
+    stat.write_text(stat.read_text().replace(str(6 * GIB), str(UNLIMITED_V1)))
+    assert linux.free_gib == 40
+
+
+def test_whatever_stands_in_the_files_is_no_error(tmp_path: Path):
+    """Sandboxes that only play Linux write what they like; what cannot be understood limits nothing, and nothing is ever below 0."""
+    draws = random.Random(0)
+    words = ["0::/", "5:memory:/a", "::", ":", "", "x", "max", "-1", "٣", "9" * 30, "9" * 5000, "0", "7", "MemAvailable:", " - ", "\x00"]
+    words += ["22 1 0:2 / /sys/fs/cgroup rw - cgroup2 c rw", "3 2 0:2 /a /sys/fs/cgroup rw - cgroup c rw,memory", "/..", "inactive_file"]
+    groups = ("memory.max", "memory.current", "memory.stat", "memory.limit_in_bytes", "memory.usage_in_bytes")
+    names = ["proc/meminfo", "proc/self/cgroup", "proc/self/mountinfo", *(f"sys/fs/cgroup/{name}" for name in groups)]
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    for _ in range(100):
+        for name in names:
+            lines = ["".join(draws.choice(words) + draws.choice(("", " ", ":")) for _ in range(draws.randint(0, 4))) for _ in range(3)]
+            (tmp_path / name).write_text("\n".join(lines))
+        free = machine.free_memory_bytes(tmp_path)
+        assert free is None or free >= 0
 
 
 def test_groups_that_cannot_be_read_and_none_at_all(tmp_path: Path):
