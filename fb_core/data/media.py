@@ -196,6 +196,12 @@ def to_srgb(linear: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
 
 
+def to_linear(srgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """sRGB values to linear light: the inverse of :func:`to_srgb`."""
+    srgb = srgb.clamp(min=0)
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+
+
 def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tensor, "c height width"]:
     """The image at another size, antialiased (a triangle as wide as the larger of both pixels); corners stay corners.
 

@@ -1,4 +1,8 @@
-"""Pictures of meshes: their own colours or textures under soft light, drawn by our triangle caster or by pyvista."""
+"""Pictures of meshes: their own colours or textures under soft light, drawn by our triangle caster or by pyvista.
+
+A triangle's colour is that of its corners, of its own, or of its material (glTF's baseColorFactor, OBJ's Kd) times its texture. glTF's
+factors are linear light (its specification, "Metallic-Roughness Material"), all else is sRGB.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from einops import rearrange, reduce
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.media import to_linear, to_srgb
 from fb_core.data.triangle_caster import TriangleHits, cast_triangles
 from fb_core.geometry.cameras import Pinholes
 
@@ -42,7 +47,13 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
     import trimesh
 
     try:
-        parts = [part for part in cast(Any, trimesh.load_scene(path)).dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        scene = cast(Any, trimesh.load_scene(path, process=False))
+        for part in scene.geometry.values():
+            if isinstance(part, trimesh.Trimesh):
+                _colour_every_triangle(part)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        for part in parts:
+            _merge_corners(part)
     except Exception as error:  # readers of formats raise whatever their libraries raise
         raise ValueError(f"mesh {path}: not readable ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
     if not parts:
@@ -58,6 +69,33 @@ def read_mesh(path: Path) -> list[trimesh.Trimesh]:
         part.apply_scale(1 / radius)
         part.apply_transform(turn)
     return parts
+
+
+def _colour_every_triangle(part: trimesh.Trimesh) -> None:
+    """Colours of a PLY file's polygons for each of the triangles that they are cut into; trimesh 5.2 keeps one for each polygon."""
+    from trimesh.visual import ColorVisuals
+
+    visual = cast(Any, part.visual)
+    if getattr(visual, "kind", None) != "face":
+        return
+    colours = np.asarray(visual._data["face_colors"])  # the property asks for as many as there are triangles
+    stored = part.metadata.get("_ply_raw", {}).get("face", {}).get("data", {})
+    has = stored.dtype.names or () if isinstance(stored, np.ndarray) else stored
+    key = next((name for name in ("vertex_indices", "vertex_index") if name in has), None)
+    if len(colours) == len(part.faces) or key is None or len(stored[key]) != len(colours):
+        return
+    lists = stored[key]["f1"] if getattr(stored[key], "dtype", np.dtype(int)).names else stored[key]  # binary: how many, and which
+    polygons = [np.asarray(polygon).reshape(-1) for polygon in lists]
+    part.faces = np.array([(one[0], one[k], one[k + 1]) for one in polygons for k in range(1, len(one) - 1)])
+    repeated = np.repeat(colours, [max(len(one) - 2, 0) for one in polygons], axis=0)
+    part.visual = ColorVisuals(mesh=part, face_colors=repeated)
+
+
+def _merge_corners(part: trimesh.Trimesh) -> None:
+    """Equal corners become one, but not where they have colours of their own, which would run into each other."""
+    part.remove_infinite_values()
+    if getattr(part.visual, "kind", None) != "vertex":
+        part.merge_vertices()
 
 
 def draw_with_caster(parts: list[trimesh.Trimesh], cameras: Pinholes, light: Lighting, *, supersample: int = 2) -> Float[Tensor, "n 3 h w"]:
@@ -85,6 +123,7 @@ class _Paint:
     places: Float[Tensor, "f 3 2"] | None = None
     """Of the corners in the texture, in [-1, 1], y down."""
     texture: Float[Tensor, "1 3 th tw"] | None = None
+    """Colours, times that of the material."""
 
 
 def _paint(part: trimesh.Trimesh, device: torch.device) -> _Paint:
@@ -110,7 +149,22 @@ def _texture(part: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray] | None:
     uv = np.asarray(uv, dtype=np.float32)
     if uv.min() < -1e-6 or uv.max() > 1 + 1e-6:  # a repeated texture
         uv = uv % 1
-    return uv, np.array(picture.convert("RGB"))
+    factor, linear = _factor(material)
+    pixels = torch.from_numpy(np.array(picture.convert("RGB"))).float() / 255
+    if bool((factor < 1).any()):
+        pixels = to_srgb(to_linear(pixels) * factor) if linear else pixels * factor
+    return uv, (pixels * 255).round().byte().numpy()
+
+
+def _factor(material: Any) -> tuple[Float[Tensor, "3"], bool]:
+    """(colour of a material, 1 where it has none, whether it is linear light)."""
+    linear = hasattr(material, "baseColorFactor")
+    value = material.baseColorFactor if linear else getattr(material, "diffuse", None)
+    if value is None:
+        return torch.ones(3), linear
+    values = np.asarray(value).reshape(-1)[:3]
+    top = 255.0 if values.dtype.kind in "iu" else 1.0
+    return torch.from_numpy(values.astype(np.float32) / top).clamp(0, 1), linear
 
 
 def _plain_colours(part: trimesh.Trimesh) -> tuple[np.ndarray, bool]:
@@ -118,6 +172,10 @@ def _plain_colours(part: trimesh.Trimesh) -> tuple[np.ndarray, bool]:
     visual = cast(Any, part.visual)
     if getattr(visual, "kind", None) == "face":
         return np.array(visual.face_colors)[:, :3], True
+    if getattr(visual, "kind", None) == "texture":  # by name, yet without a picture: the material's colour is all there is
+        factor, linear = _factor(visual.material)
+        colour = ((to_srgb(factor) if linear else factor) * 255).round().byte().numpy()
+        return np.tile(colour, (len(part.vertices), 1)), False
     plain = visual if hasattr(visual, "vertex_colors") else visual.to_color()
     return np.array(plain.vertex_colors)[:, :3], False
 

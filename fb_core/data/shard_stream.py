@@ -6,7 +6,9 @@ rows, so the shards are split over processes and rows alike. Nothing is shuffled
 
 from __future__ import annotations
 
+import inspect
 import logging
+import re
 import tarfile
 from collections.abc import Iterator
 from functools import lru_cache
@@ -126,14 +128,33 @@ def shard_length(shard: str) -> int:
         try:
             with tarfile.open(shard, "r:") as file:
                 names = [member.name for member in file if member.isreg()]
-            keys = [name[: len(name) - len(Path(name).name)] + Path(name).name.split(".", 1)[0] for name in names]
-            return sum(key != before for key, before in zip(keys, [None, *keys], strict=False))
+            return _count(_samples_named(names, shard))
         except (tarfile.TarError, OSError):
             pass
+    return _count(samples_of(shard))
+
+
+def _count(samples: Iterator[dict[str, Any]]) -> int:
+    """How many come before the end, or before the first that is damaged."""
     length = 0
     try:
-        for _ in samples_of(shard):
+        for _ in samples:
             length += 1
     except (tarfile.TarError, OSError, EOFError, ValueError):
         pass
     return length
+
+
+def _samples_named(names: list[str], shard: str) -> Iterator[dict[str, Any]]:
+    """The samples without their data that WebDataset makes of files with these names, by its own rules: it leaves out names that begin
+    with a dot or have no suffix, and what it keeps for itself, without a break between the samples around them."""
+    from webdataset import tariterators
+
+    kept_for_itself = inspect.signature(tariterators.tar_file_iterator).parameters["skip_meta"].default
+    prefix, suffix = tariterators.meta_prefix, tariterators.meta_suffix
+    own = [
+        name
+        for name in names
+        if not ("/" not in name and name.startswith(prefix) and name.endswith(suffix)) and not re.match(kept_for_itself, name)
+    ]
+    return tariterators.group_by_keys({"fname": name, "data": b"", "__url__": shard} for name in own)
