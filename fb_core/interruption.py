@@ -28,7 +28,7 @@ def raise_interrupt(number: int) -> NoReturn:
 def stop_on_signals(stop: Callable[[int], object] = raise_interrupt) -> None:
     """From now on ``stop(number)``, which raises or notes it, is called in the main thread for SIGINT and SIGTERM.
 
-    A signal that comes during an import waits for the end of it, and one whose error was lost in a place from where Python
+    A signal that comes during an import waits for the very end of it, and one whose error was lost in a place from where Python
     cannot raise (a destructor, a callback of C code) comes again. Outside the main thread Python sets no handlers, nor does this.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -39,10 +39,13 @@ def stop_on_signals(stop: Callable[[int], object] = raise_interrupt) -> None:
     def handle(number: int, frame: FrameType | None) -> None:
         nonlocal came
         came = signal.Signals(number)
-        if _is_importing(frame):
-            _again(number)
-        else:
+        importer = _importer(frame)
+        if importer is None:
             stop(number)
+        elif sys.gettrace() is None:
+            _call_after_import(importer, lambda: stop(number))
+        else:  # a debugger's place
+            _again(number)
 
     def report(lost: Any) -> None:
         """Errors that Python could not raise are printed, as it does; an interruption comes again."""
@@ -65,9 +68,24 @@ def _again(number: int) -> None:
     later.start()
 
 
-def _is_importing(frame: FrameType | None) -> bool:
+def _importer(frame: FrameType | None) -> FrameType | None:
+    """The frame whose code has begun the outermost import that is under way; None outside of imports."""
+    found = None
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
+            found = frame.f_back
         frame = frame.f_back
-    return False
+    return found
+
+
+def _call_after_import(importer: FrameType, call: Callable[[], object]) -> None:
+    """Call as soon as this frame goes on, which is when its import has ended, and before anything else. Asking again later by the clock
+    would miss commands that end soon after."""
+
+    def trace(frame: FrameType, event: str, argument: Any) -> None:
+        sys.settrace(None)
+        frame.f_trace, frame.f_trace_opcodes = None, False
+        call()
+
+    importer.f_trace, importer.f_trace_opcodes = trace, True  # not at its next line, but at once
+    sys.settrace(lambda *_: None)  # of this thread: new frames are not traced, the importer's is

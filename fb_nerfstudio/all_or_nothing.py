@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -34,9 +35,9 @@ def _kept(splats: Any, optimizers: Any) -> Any:
     if gaussians is None:
         return lambda: None
     parameters, counted, info = dict(gaussians.items()), dict(splats.strategy_state), splats.info
-    trainers: Any = optimizers
-    groups = {} if trainers is None else {name: list(values) for name, values in trainers.parameters.items()}
-    moments = {} if trainers is None else {name: _moments(optimizer) for name, optimizer in trainers.optimizers.items()}
+    owners = optimizers or SimpleNamespace(parameters={}, optimizers={})
+    groups = {name: list(values) for name, values in owners.parameters.items()}
+    moments = {name: _moments(optimizer) for name, optimizer in owners.optimizers.items()}
 
     def put_back() -> None:
         for name, values in parameters.items():
@@ -45,9 +46,9 @@ def _kept(splats: Any, optimizers: Any) -> Any:
         splats.strategy_state.update(counted)
         splats.info = info
         for name, values in groups.items():
-            trainers.parameters[name] = values
+            owners.parameters[name] = values
         for name, (state, trained) in moments.items():
-            optimizer = trainers.optimizers[name]
+            optimizer = owners.optimizers[name]
             optimizer.state.clear()
             optimizer.state.update({parameter: dict(values) for parameter, values in state.items()})
             for group, values in zip(optimizer.param_groups, trained, strict=True):

@@ -184,9 +184,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         completion = self.config.completion
         if not completion.enabled or self._finished or step < completion.at_step:
             return
-        keep = getattr(attributes.trainer, "keep_what_is_trained", None)
-        if keep is not None:
-            keep()  # a generation may take long, or fail
+        trainer: Any = attributes.trainer
+        if hasattr(trainer, "generation_begins"):  # not every trainer is ours
+            trainer.generation_begins()
         with self._at_work(), own_randomness(self.device, seed=completion.seed, step=step):
             self._complete(attributes, step)
 
@@ -286,7 +286,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
-            _logger.warning("Not done: %s: %s", request, error, exc_info=None if isinstance(error, ValueError) else error)
+            _logger.warning("%s: not done: %s", type(request).__name__, error, exc_info=None if isinstance(error, ValueError) else error)
             if asked is None and isinstance(request, RegenerateRound):  # it stays outdated, but is not tried before every iteration
                 self._given_up.add(request.number)
                 _logger.warning("Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number)

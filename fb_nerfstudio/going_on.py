@@ -164,7 +164,10 @@ def check_capture(config: Any, path: Path, state: dict[str, Any], outputs: Datap
     known = (state["pipeline"].get("datamanager._extra_state") or {}).get("capture")
     if known is None or config.other_capture:
         return
-    difference = CaptureIdentity.of(outputs).difference(CaptureIdentity.from_state(known))
+    try:
+        difference = CaptureIdentity.of(outputs).difference(CaptureIdentity.from_state(known))
+    except (KeyError, TypeError, AttributeError, RuntimeError, IndexError):
+        difference = "what it says about its own cannot be read"
     if difference is not None:
         data = config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data
         raise ValueError(f"checkpoint {path} is of another capture than {data}: {difference}; give its own --data ({_INSIST})")

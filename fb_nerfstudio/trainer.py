@@ -133,7 +133,7 @@ class FillerbusterTrainer(Trainer):
             except _AskedToStop as asked:
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, signal.SIG_DFL)
-                self.keep_what_is_trained()
+                self._keep_what_is_trained()
                 self.config._stop(asked.number)
 
     def _asked_to_stop(self, number: int) -> None:
@@ -153,7 +153,13 @@ class FillerbusterTrainer(Trainer):
         if self._asked:
             raise _AskedToStop(self._asked)
 
-    def keep_what_is_trained(self) -> None:
+    def generation_begins(self) -> None:
+        """Called before views are generated, which may take long, or fail: what was trained is saved, or the training ends as asked."""
+        self._keep_what_is_trained()
+        if self._asked:
+            raise _AskedToStop(self._asked)
+
+    def _keep_what_is_trained(self) -> None:
         """Save the last whole step, if there is one that is not saved. Not to be called within a step that has changed anything."""
         if self._unsaved is not None:
             self.save_checkpoint(self._unsaved)

@@ -268,7 +268,7 @@ def test_the_queue_is_read_under_its_lock():
 def test_the_manager_keeps_what_was_trained_before_it_generates(tiny_capture: Path, tmp_path: Path, monkeypatch):
     manager: FillerbusterDataManager = make(tiny_capture, options(at_step=2))
     order: list[str] = []
-    monkeypatch.setattr(ToyTrainer, "keep_what_is_trained", lambda self: order.append("kept"), raising=False)
+    monkeypatch.setattr(ToyTrainer, "generation_begins", lambda self: order.append("kept"), raising=False)
     monkeypatch.setattr(FillerbusterDataManager, "_complete", lambda self, *_: order.append(f"generated, at work: {self.at_work}"))
     attrs = generated(manager, tmp_path, step=1)
     run_callbacks(manager, attrs, 2)

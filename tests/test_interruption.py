@@ -44,6 +44,24 @@ def test_a_module_that_swallows_every_error_does_not_swallow_ctrl_c(tmp_path: Pa
     assert child.stdout.split("\n") == ["whole", "told True", ""], child
 
 
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import optional; print('went on')",
+        "def command():\n    import optional\ncommand()\nprint('went on')",
+        "import importlib\nimportlib.import_module('optional')\nprint('went on')",
+        "try:\n    import broken\nexcept ImportError:\n    print('went on')",
+        "try:\n    import optional\n    raise ValueError\nexcept ValueError:\n    print('went on')",
+    ],
+)
+def test_nothing_happens_between_the_end_of_an_import_and_the_interruption(program: str, tmp_path: Path):
+    """A command that fails, or ends, at once is no exception."""
+    (tmp_path / "optional.py").write_text(f"import os, signal\n{INTERRUPT}\nimport json\n")
+    (tmp_path / "broken.py").write_text(f"import os, signal\n{INTERRUPT}\nimport nowhere_at_all\n")
+    child = ended(program, tmp_path)
+    assert child.stdout == "" and child.stderr.splitlines()[-1] == "KeyboardInterrupt", child
+
+
 def test_sigterm_waits_for_an_import_too(tmp_path: Path):
     (tmp_path / "optional.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nprint('whole')\n")
     child = ended("import optional\ntime.sleep(20)", tmp_path)

@@ -86,6 +86,19 @@ def in_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FillerbusterTrainer, "eval_iteration", eval_iteration)
 
 
+def just_before_the_generation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A moment in which it is noted, as in every step: the generation does not begin."""
+    due = FillerbusterDataManager._complete_when_due
+
+    def complete_when_due(self: FillerbusterDataManager, attributes: Any, step: int) -> None:
+        if step == AT_STEP:
+            interrupt()
+            monkeypatch.setattr(FillerbusterDataManager, "_complete", lambda *_: pytest.fail("it generates"))
+        due(self, attributes, step)
+
+    monkeypatch.setattr(FillerbusterDataManager, "_complete_when_due", complete_when_due)
+
+
 def in_the_generation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before its first round; what was trained until then is saved."""
     plan = FillerbusterDataManager._seen_points
@@ -112,6 +125,7 @@ def while_gaussians_are_placed(monkeypatch: pytest.MonkeyPatch) -> None:
 MOMENTS: dict[Callable[[pytest.MonkeyPatch], None], int] = {
     in_the_step: 1,
     in_an_evaluation: 1,
+    just_before_the_generation: AT_STEP - 1,
     in_the_generation: AT_STEP - 1,
     while_gaussians_are_placed: AT_STEP - 1,
 }
