@@ -32,6 +32,7 @@ from method_configs.masked_evaluation import Masked, Paper
 from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
+from method_configs.scene_evaluation import Scene
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
 
@@ -327,9 +328,10 @@ def evaluate(
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
         | Annotated[Masked, tyro.conf.subcommand("masked")]
         | Annotated[Designs, tyro.conf.subcommand("designs")]
+        | Annotated[Scene, tyro.conf.subcommand("scene")]
     ],
 ) -> None:
-    """Measure how good a model is on unseen rooms."""
+    """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""
     evaluation.run()
 
 

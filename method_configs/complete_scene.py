@@ -42,6 +42,7 @@ from method_configs.complete_output import FilmFiles, NewViews
 from method_configs.scene_budget import SceneBudget, Speed, measured_speed
 from method_configs.scene_training import train_scene
 
+_FEATURES_SIDE = 960  # of photos in which features are sought for the first Gaussians
 _GENERATED_SHARE = 0.3  # as ns-train fillerbuster
 _LARGE = 1000.0  # spreads off the origin from which single precision moves Gaussians: the file's world is then shifted
 _logger = logging.getLogger(__name__)
@@ -133,6 +134,7 @@ def complete_with_splats(job: SceneJob, *, seconds: float, on_progress: OnProgre
     budget = _budget(job, seconds)
     _logger.info(announcement(job, budget))
     capture = _capture_to_train(job, budget.photo_side)
+    budget = dataclasses.replace(budget, schedule=dataclasses.replace(budget.schedule, scale=_scale_of(capture, budget.photo_side)))
     splats, generated, trust = _trained(job, capture, budget, on_progress)
     film, shares = _film(job, capture, splats, budget, on_progress)
     told = {
@@ -196,13 +198,13 @@ def _budget(job: SceneJob, seconds: float) -> SceneBudget:
 
 
 def _capture_to_train(job: SceneJob, side: int) -> Capture:
-    """The photos made small, all of them to be trained on, in the world of the training."""
+    """The photos, all of them to be trained on, in the world of the training; larger than they are trained on, for the sake of features."""
     folder = job.work / "capture"
     if folder.is_dir():
         return read_capture(folder)
     frames = []
     for photo, camera in zip(job.photos, job.cameras, strict=True):
-        image, mask = photo.load_with_mask(side)
+        image, mask = photo.load_with_mask(max(side, _FEATURES_SIDE))
         camera = job.to_work.cameras(camera).scaled(image.shape[2], image.shape[1])
         frames.append(FrameToWrite(name=photo.name, image=image, mask=None if bool((mask >= 1).all()) else mask, camera=camera))
     names = [f"images/{frame.name}.png" for frame in frames]
@@ -212,6 +214,11 @@ def _capture_to_train(job: SceneJob, side: int) -> Capture:
         read = read_points(job.points_path)
         points = Points(positions=job.to_work.points(read.positions), colors=read.colors) if len(read) else None
     return write_capture(folder, frames, points=points, extra=extra)
+
+
+def _scale_of(capture: Capture, side: int) -> float:
+    """What makes the longest side of the largest picture so many pixels."""
+    return min(1.0, side / max(max(size) for size in capture.sizes))
 
 
 def _trained(
@@ -295,7 +302,7 @@ def _film(
     for number in range(len(cameras)):
         if not film.told(number).is_file():
             if seen is None:
-                seen = _seen(job, capture, splats, on_progress)
+                seen = _seen(job, capture, splats, budget.schedule.scale, on_progress)
             frame = film_frame(splats, seen, cameras[number].moved(-job.offset), blur=blur_of(job, cameras, budget.photo_side))
             _keep_frame(film, number, frame)
         shares.append({name: float(value) for name, value in read_json(film.told(number)).items()})
@@ -310,11 +317,14 @@ def blur_of(job: SceneJob, cameras: Pinholes, photo_side: int) -> float:
     return BLUR * max(1.0, float(cameras.focal.mean()) / trained) ** 2
 
 
-def _seen(job: SceneJob, capture: Capture, splats: Splats, on_progress: OnProgress) -> Bool[Tensor, " m"]:
+def _seen(job: SceneJob, capture: Capture, splats: Splats, scale: float, on_progress: OnProgress) -> Bool[Tensor, " m"]:
     """Which of the splats the photos show, as large as they were trained on."""
     back = job.to_work.inverse
-    cameras = [back.cameras(frame.camera).moved(-job.offset) for frame in capture.frames]
-    masks = [None if frame.mask_path is None else frame.load_mask()[0] >= 0.5 for frame in capture.frames]
+    cameras, masks = [], list[Bool[Tensor, "_h _w"] | None]()
+    for frame in capture.frames:
+        width, height = (max(1, int(side * scale)) for side in (frame.camera.width, frame.camera.height))
+        cameras.append(back.cameras(frame.camera).moved(-job.offset).scaled(width, height))
+        masks.append(None if frame.mask_path is None else media.resize(frame.load_mask(), height, width)[0] >= 0.5)
     return seen_by_photos(splats, cameras, masks, lambda done, total: on_progress("looking at what photos show", done, total))
 
 

@@ -13,11 +13,11 @@ from fb_nerfstudio.splat_backend import render_splats
 from fb_nerfstudio.splat_file import Splats
 from method_configs.scene_training import SceneSchedule
 
+_COMPLETE_AT = 500  # as ns-train fillerbuster
 FEWEST_STEPS, MOST_STEPS = 300, 7000
 _WANTED_STEPS = 1500  # enough for what photos show; more time goes into larger pictures first
 _SIDES = (64, 96, 128, 160, 240, 320, 480, 640, 960, 1280, 1920, 2560, 3840)  # of pictures that splats are trained on
 _TRAINING_SHARE, _FILM_SHARE = 0.65, 0.2  # of the time; the rest is for new views, files, and for guesses that were too low
-_COARSE = 0.75  # what a step costs on average, since the first quarter of them sees pictures of half the side
 _PROBE_SIDE, _PROBE_SPLATS = 96, 4000
 _LEAST_SECONDS = 10.0
 _ON_CPU, _ON_GPU = 20_000, 500_000  # Gaussians
@@ -76,7 +76,7 @@ class SceneBudget:
         wanted = _WANTED_STEPS if steps is None else steps
 
         def training(side: int, steps: int) -> float:
-            return _COARSE * steps * speed.step * aspect * side**2
+            return steps * speed.step * aspect * side**2
 
         def film(side: int) -> float:
             return frames * speed.frame * aspect * side**2
@@ -95,7 +95,7 @@ class SceneBudget:
         return SceneBudget(
             photo_side=side,
             film_side=film_side,
-            schedule=SceneSchedule(steps=steps, complete_at=max(1, steps // 2), most_gaussians=most),
+            schedule=SceneSchedule(steps=steps, complete_at=min(_COMPLETE_AT, max(1, steps // 2)), most_gaussians=most),
             seconds=training(side, steps) + film(film_side),
         )
 
@@ -131,7 +131,7 @@ def measured_speed(device: str) -> Speed:
     return Speed(step=_STEP_FACTOR * min(steps) / side**2, frame=_FRAME_FACTOR * min(frames) / side**2)
 
 
-_STEP_FACTOR, _FRAME_FACTOR = 2.0, 1.5  # losses, optimizer and denser scenes beside the bare probe
+_STEP_FACTOR, _FRAME_FACTOR = 1.4, 1.2  # losses, optimizer and denser scenes beside the bare probe
 
 
 def _step(splats: Splats, camera: Pinholes) -> None:

@@ -20,6 +20,7 @@ from fb_nerfstudio.splat_file import Splats
 from method_configs.finished_run import quiet
 from method_configs.splats import fillerbuster
 
+_WHOLE_STEPS = 1000  # trainings of fewer steps have a shorter schedule
 CHECKPOINTS = 8
 """Checkpoints that a training leaves on its way."""
 _ON_PROGRESS = Callable[[str, int, int], None]
@@ -35,6 +36,8 @@ class SceneSchedule:
     """Step before which new views are generated."""
     most_gaussians: int
     """At most so many."""
+    scale: float = 1.0
+    """Size of the pictures that are trained on over that of the capture's, whose details tell where the first Gaussians stand."""
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.most_gaussians < 1:
@@ -83,7 +86,7 @@ def train_scene(
             _tell(trainer, schedule.steps, on_progress)
             trainer.train()
         splats = Splats.of_parameters(model.gauss_params, sh_degree=model.config.sh_degree)
-        return TrainedScene(splats=splats, generated=manager.generated_views, trust=manager.get_extra_state()["trust"])
+        return TrainedScene(splats=splats, generated=manager.generated_views, trust=manager.get_extra_state().get("trust"))
 
 
 def scene_config(capture: Path, folder: Path, schedule: SceneSchedule, completion: CompletionConfig, *, device: str, seed: int) -> Any:
@@ -96,18 +99,16 @@ def scene_config(capture: Path, folder: Path, schedule: SceneSchedule, completio
     config.max_num_iterations, config.steps_per_save = steps, max(1, -(-steps // CHECKPOINTS))
     config.steps_per_eval_image = config.steps_per_eval_all_images = 10 * steps  # the film is the evaluation
     config.logging.local_writer.enable, config.logging.steps_per_log = False, max(1, steps // 20)
-    config.optimizers["means"]["scheduler"].max_steps = steps
+    scheduler = config.optimizers["means"]["scheduler"]
+    scheduler.max_steps = max(scheduler.max_steps, steps)
     manager, model = config.pipeline.datamanager, config.pipeline.model
-    manager.completion, manager.data = completion, capture
+    manager.completion, manager.data, manager.camera_res_scale_factor = completion, capture, schedule.scale
     parser = manager.dataparser  # the capture's world is that of the training
     parser.orientation_method, parser.center_method, parser.auto_scale_poses = "none", "none", False
     model.max_gaussians = schedule.most_gaussians
-    model.sh_degree = 1
-    model.sh_degree_interval = max(1, steps // 4)
-    model.warmup_length, model.refine_every = max(1, steps // 10), max(1, steps // 30)
-    model.stop_screen_size_at, model.stop_split_at = steps // 3, 2 * steps // 3
-    model.reset_alpha_every = steps  # times refine_every: never within the training
-    model.num_downscales, model.resolution_schedule = 1, max(1, steps // 4)
+    shorter = min(1.0, steps / _WHOLE_STEPS)
+    for name in ("warmup_length", "refine_every", "stop_screen_size_at", "stop_split_at"):
+        setattr(model, name, max(1, round(getattr(model, name) * shorter)))
     model.normal_loss_from = steps  # a film shows no normals, and they take a third of the time
     model.output_normals = False
     checkpoints = config.get_checkpoint_dir()

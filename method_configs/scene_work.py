@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ try:
 except ImportError:  # no system with such locks
     fcntl = None
 
+_logger = logging.getLogger(__name__)
 KIND = "scene in progress"
 _FORMAT = 1  # of what is kept
 _JOB, _CAMERAS, _LOCK = "job.json", "cameras.pt", "lock"
@@ -39,7 +41,10 @@ _OURS = {_JOB, _CAMERAS, _LOCK, "capture", "runs", "film", "path.json", "splats.
 
 def question_of(photos: Sequence[Photo], options: Any, model_hash: str | None) -> str:
     """A text that is the same for the same photos, options and weights, and for nothing else."""
-    files = [(photo.name, str(photo.source), photo.source.stat().st_size, photo.source.stat().st_mtime_ns) for photo in photos]
+    files = []
+    for photo in photos:
+        file, pose = photo.source.stat(), None if photo.camera is None else photo.camera.camera_to_world.flatten().tolist()
+        files.append((photo.name, str(photo.source), photo.seconds, file.st_size, file.st_mtime_ns, pose))
     told = {"format": _FORMAT, "photos": files, "options": {key: str(value) for key, value in dataclasses.asdict(options).items()}}
     return hashlib.sha256(json.dumps(told | {"model": model_hash}, sort_keys=True).encode()).hexdigest()
 
@@ -68,7 +73,12 @@ def work_beside(output: Path, question: str) -> Iterator[Path]:
                 unfinished.write_text(mark_text(KIND, []), encoding="utf-8")
             with whole_file(folder / _JOB) as unfinished:
                 unfinished.write_text(json.dumps({"question": question}), encoding="utf-8")
-        yield folder
+        try:
+            yield folder
+        except (KeyboardInterrupt, SystemExit) as error:
+            if not isinstance(error, ValueError):
+                _logger.info("What is done is kept; the same command goes on from there.")
+            raise
         _remove(folder)
 
 
