@@ -16,7 +16,8 @@ from fb_core.geometry.coverage import Coverage, shown_by
 from fb_core.geometry.paths import CaptureShape, sphere_directions
 
 _DIRECTIONS = 256
-_SIDE_SEEN = math.cos(math.radians(30))  # a side of an object is seen by cameras within so many degrees of it
+SIDE_SEEN = math.cos(math.radians(30))
+"""A side of an object is seen by cameras whose direction from its middle has at least this cosine with its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +56,13 @@ def looking_in(places: Float[Tensor, "p 3"], shape: CaptureShape, cameras: Seque
     """Views of what a capture surrounds: from every place to the middle. Its sides are where the places lie."""
     from_middle = F.normalize(places - shape.focus, dim=1)
     captured = F.normalize(torch.cat([camera.centers for camera in cameras]) - shape.focus, dim=1)
-    seen = (from_middle @ captured.T > _SIDE_SEEN).any(dim=1)
+    seen = (from_middle @ captured.T > SIDE_SEEN).any(dim=1)
     weight = torch.ones(len(places), dtype=places.dtype)
     return Candidates(
         centers=places,
         looks=-from_middle,
         coverage=Coverage(surface=shape.focus + from_middle * shape.radius, weight=weight, seen=seen),
-        sides=from_middle @ from_middle.T > _SIDE_SEEN,
+        sides=from_middle @ from_middle.T > SIDE_SEEN,
     )
 
 

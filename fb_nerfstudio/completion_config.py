@@ -86,6 +86,8 @@ class CompletionConfig:
     """Where the capture decides (`anchor_views` None): share of what it has not seen that a further view must show, from 0 to 1."""
     camera_path: Path | None = None
     """Camera path saved in nerfstudio's viewer (Render tab): generate these views, where they are, instead of placing cameras."""
+    film_path: Path | None = None
+    """Where the capture decides: a camera path like the former, of a film that is to be made; its views are candidates beside others."""
     masked: MaskedConfig = field(default_factory=MaskedConfig)
     """Which captured pictures are inpainted."""
     image_size: int | None = None

@@ -35,6 +35,7 @@ from fb_nerfstudio.candidate_views import Candidates, looking_in, looking_out
 from fb_nerfstudio.completed_views import ANCHOR, DENSIFY
 from fb_nerfstudio.completion_config import CompletionConfig, PlacementConfig
 from fb_nerfstudio.context_views import nearest_context
+from fb_nerfstudio.path_candidates import with_path
 
 _ANCHOR_LEVELS, _DENSIFY_LEVELS = 2, 3
 _SEEN_NEED = 0.2  # looking at what the capture has seen is worth this much of looking at what it has not
@@ -183,6 +184,8 @@ def _needed_rounds(
     """
     half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
     places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)))
+    if config.film_path is not None:
+        places = with_path(places, read_camera_path(config.film_path, size=size).cameras, site.shape)
     chosen = choose_views(
         places.coverage,
         places.shown(half_angle),

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from fb_nerfstudio.torch_rasterizer import RenderMode, rasterization
 
+BLUR = 0.3
+"""Variance in square pixels that every Gaussian is widened by on the screen; gsplat's."""
 _logger = logging.getLogger(__name__)
 
 
@@ -47,6 +49,7 @@ def render_splats(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     radius_clip: float = 0.0,
+    eps2d: float = BLUR,
     sh_degree: int | None = None,
     backgrounds: Float[Tensor, "c d"] | None = None,
     render_mode: RenderMode = "RGB",
@@ -65,6 +68,7 @@ def render_splats(
         near_plane=near_plane,
         far_plane=far_plane,
         radius_clip=radius_clip,
+        eps2d=eps2d,
         sh_degree=sh_degree,
         packed=False,
         render_mode=render_mode,

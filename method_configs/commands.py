@@ -34,6 +34,7 @@ from method_configs.masked_evaluation import Masked, Paper
 from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
+from method_configs.scene_evaluation import Scene
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
 
@@ -173,16 +174,22 @@ def complete(
     precision: Literal["auto", "float32", "bfloat16"] = "auto",
     fps: float = 8.0,
     check: bool = True,
+    frames: Literal["scene", "model"] = "scene",
+    minutes: float = 5.0,
+    film_size: int | None = None,
+    photo_size: int | None = None,
+    iterations: int | None = None,
+    generate: bool = True,
     overwrite: bool = False,
 ) -> None:
-    """Complete a scene from photos alone: find their cameras, generate views along a path, leave a capture for ns-train.
+    """Complete a scene from photos alone: cameras, splats, views of what no photo shows; leaves a film, and a capture for ns-train.
 
     Args:
         source: Folder of photos, film, or posed capture (whose cameras are then known).
-        output: New folder: capture, fly-through.mp4, sheet.png, cameras.png, raymaps, report.json.
+        output: New folder: capture, splats.ply, fly-through.mp4, trust.mp4, sheet.png, cameras.png, raymaps, report.json.
         cameras: What finds cameras: the model's raymaps, features, or the model and, where it is not sure, features.
         path: ellipse (fitted to the cameras), orbit, spiral, or a camera path's JSON file in the world of the capture.
-        views: New views along the path.
+        views: Pictures of the film along the path.
         photos: Photos that new views are conditioned on, chosen by coverage; all photos get cameras.
         poses_only: Find cameras and generate nothing.
         known_poses: Capture that knows the cameras of some of the photos, by their file names.
@@ -190,13 +197,20 @@ def complete(
         seed: Decides all that is drawn.
         size: Side of new views in pixels; by default the model's.
         steps: Denoising steps; by default the model's recommendation.
-        sequence: Most views, photos and new ones together, that the model sees at once; more are generated in further passes.
+        sequence: With --frames model, most views, photos and new ones together, that the model sees at once; more come in further passes.
         prompt: What is to be seen, for models that read text.
         text_encoder: Folder with the CLIP text model, which prompts need.
         device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
         precision: Of the model's matrix products (auto: bfloat16 where the machine is faster at it).
         fps: Pictures per second of the film.
-        check: Look for the cameras of photos and new views once more, and report how far they are off (self-consistency).
+        check: With --frames model, look for the cameras of photos and new views once more, and report how far they are off.
+        frames: scene: the film shows splats of the photos, with new views where no photo shows anything; model: the model's own pictures
+            of the path (the paper).
+        minutes: Time that a scene may take, about; it decides the sizes and steps that are not given.
+        film_size: Longest side of the scene's film in pixels, at most that of the photos.
+        photo_size: Longest side of the photos that splats are trained on.
+        iterations: Training steps of the splats.
+        generate: Let the model make up what no photo shows; without, the scene shows what photos do.
         overwrite: Replace an earlier output there.
     """
     from method_configs.complete_command import complete_scene
@@ -220,6 +234,12 @@ def complete(
         precision=precision,
         fps=fps,
         check=check,
+        frames=frames,
+        minutes=minutes,
+        film_size=film_size,
+        photo_size=photo_size,
+        iterations=iterations,
+        generate=generate,
     )
     complete_scene(source, output, options, overwrite=overwrite)
 
@@ -312,9 +332,10 @@ def evaluate(
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
         | Annotated[Masked, tyro.conf.subcommand("masked")]
         | Annotated[Designs, tyro.conf.subcommand("designs")]
+        | Annotated[Scene, tyro.conf.subcommand("scene")]
     ],
 ) -> None:
-    """Measure how good a model is on unseen rooms."""
+    """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""
     _require_free_places(evaluation)
     evaluation.run()
 

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,24 +66,40 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
         job = _read(source, options)
     target = _with_pictures(target, job.photos)
     target.check()
+    scene = options.frames == "scene" and not options.poses_only
     with clock.stage("loading the model"):
-        model = _load_model(options, needed=not options.poses_only or (options.cameras != "features" and not job.all_known))
-    found, new, told = _work(job, options, model, clock)
-    enough = len(found.trusted) >= FEWEST
-    report = report_of(source, options, job.photos, job.left_out, model, found, told)
-    try:
-        with whole_folder(target) as folder:
-            with clock.stage("writing"):
-                world = job.world if enough or not found.trusted else dataclasses.replace(job.world, points_path=None)
-                write_folder(folder, job.photos, job.left_out, found, new, world, fps=options.fps)
-            report |= {"seconds": clock.seconds, "peak_memory_gib": round(_peak_memory_gib(), 3)}
-            write_report(folder, report)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{output}: {error}; nothing was written") from error
+        from_model = not options.poses_only and not scene
+        model = _load_model(options, needed=from_model or (options.cameras != "features" and not job.all_known))
+    with _work_of_scene(job, options, output, model) if scene else nullcontext() as work:
+        found, new, told = _work(job, options, model, clock, work)
+        enough = len(found.trusted) >= FEWEST
+        report = report_of(source, options, job.photos, job.left_out, model, found, told)
+        try:
+            with whole_folder(target) as folder:
+                with clock.stage("writing"):
+                    world = job.world if enough or not found.trusted else dataclasses.replace(job.world, points_path=None)
+                    write_folder(folder, job.photos, job.left_out, found, new, world, fps=options.fps)
+                report |= {"seconds": clock.seconds, "peak_memory_gib": round(_peak_memory_gib(), 3)}
+                write_report(folder, report)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{output}: {error}; nothing was written") from error
     if not enough:
         raise NoCameras(no_cameras(job.photos, found, output))
     _logger.info("wrote %s: %d photos with cameras, %d new views", output, len(found.trusted), 0 if new is None else len(new.images))
     return report
+
+
+def _work_of_scene(job: Job, options: CompleteOptions, output: Path, model: Fillerbuster | None) -> AbstractContextManager[Path]:
+    """Where the work is kept. Raises ValueError in one sentence for a model, a prompt or a path that cannot be used."""
+    from fb_nerfstudio.completion_config import CompletionConfig  # nerfstudio takes a while
+    from fb_nerfstudio.refusal import refuse_bad_model
+    from method_configs.scene_work import question_of, work_beside
+
+    given = {"model": options.model, "prompt": options.prompt or "", "text_encoder": options.text_encoder}
+    refuse_bad_model(CompletionConfig(enabled=options.generate, **given))
+    if options.path not in PATHS:
+        _path_of_file(options, _CHECKED_SIDE)  # says what is wrong with it
+    return work_beside(output, question_of(job.photos, options, None if model is None else model.model_hash))
 
 
 # ---- input --------------------------------------------------------------------------------------------------------------------
@@ -195,19 +211,18 @@ def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | Non
 
 
 def _work(
-    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path | None = None
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
-    """Cameras, then new views; what the report is to say of these."""
+    """Cameras, then new views; what the report is to say of these. With a folder to work in, a scene and its film."""
+    if work is not None:
+        return _work_on_scene(job, options, model, clock, work)
     side = None if model is None else options.size or model.size
     path = None if side is None else _path_of_file(options, side)
     views = options.views if path is None else len(path)
     plan = None if model is None or options.poses_only else Plan.of(len(job.photos), views, model, options)
     sampling = None if model is None else pose_sampling(model, options)
     _logger.info(announcement(job.photos, options, model, plan, sampling))
-    with _bars() as on_progress, clock.stage("cameras"):
-        found = find_cameras(job.photos, method=options.cameras, model=model, seed=options.seed, sampling=sampling, on_progress=on_progress)
-    for line in what_was_found(job.photos, found):
-        _logger.info(line)
+    found = _find_cameras(job, options, model, clock)
     if plan is None or model is None or len(found.trusted) < FEWEST:
         return found, None, {}
     context = choose_context(found, options.photos)
@@ -246,6 +261,40 @@ def _work(
     if options.check:
         with _bars(), clock.stage("self-consistency"):
             told["self_consistency"] = _self_consistency(job.photos, found, context, new, model, options)
+    return found, new, told
+
+
+def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock) -> FoundCameras:
+    """And say what was found."""
+    sampling = None if model is None else pose_sampling(model, options)
+    with _bars() as on_progress, clock.stage("cameras"):
+        found = find_cameras(job.photos, method=options.cameras, model=model, seed=options.seed, sampling=sampling, on_progress=on_progress)
+    for line in what_was_found(job.photos, found):
+        _logger.info(line)
+    return found
+
+
+def _work_on_scene(
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path
+) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
+    """Cameras, splats, new views where they are needed, a film; what an earlier try has kept is not done again."""
+    from method_configs.complete_scene import SceneJob, complete_with_splats
+    from method_configs.scene_work import keep_cameras, kept_cameras
+
+    began = time.perf_counter()
+    found = kept_cameras(work)
+    if found is None:
+        _logger.info(announcement(job.photos, options, model, None, None if model is None else pose_sampling(model, options)))
+        found = _find_cameras(job, options, model, clock)
+        keep_cameras(work, found)
+    else:
+        _logger.info("Going on with what an earlier try has left: %d cameras are there.", len(found.trusted))
+    if len(found.trusted) < FEWEST:
+        return found, None, {}
+    scene = SceneJob.of(job.photos, found, job.world.points_path, options, work)
+    left = 60 * options.minutes - (time.perf_counter() - began)
+    with _bars() as on_progress, clock.stage("scene"):
+        new, told = complete_with_splats(scene, seconds=left, on_progress=on_progress)
     return found, new, told
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from fb_core.fly_through import Passes, plan_passes, room_beside
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_VIEWS, require_between
+from fb_core.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_STEPS, MOST_VIEWS, require_between
 from fb_core.model_registration import ROUNDS
 from fb_core.networks.precision import Precision
 
@@ -17,6 +17,8 @@ CHECKED = 8
 """Photos, and new views, that the self-consistency is measured on."""
 POSES_AT_ONCE = 16
 """Photos whose raymaps are denoised together; more are registered in windows."""
+
+_MOST_MINUTES = 7 * 24 * 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +59,18 @@ class CompleteOptions:
     """Pictures per second of the film."""
     check: bool = True
     """Look for the cameras of photos and new views once more, and report how far they are off."""
+    frames: Literal["scene", "model"] = "scene"
+    """The film shows splats of the photos, completed where no photo shows anything; or the model's own pictures (the paper)."""
+    minutes: float = 5.0
+    """Time that a scene may take, about; it decides sizes and steps that are not given."""
+    film_size: int | None = None
+    """Longest side of the scene's film in pixels, at most that of the photos; None is by the time."""
+    photo_size: int | None = None
+    """Longest side of the photos that splats are trained on; None is by the time."""
+    iterations: int | None = None
+    """Training steps of the splats; None is by the time."""
+    generate: bool = True
+    """Let the model make up what no photo shows; without, the scene shows what photos do."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -65,11 +79,16 @@ class CompleteOptions:
             ("sequence", 2, MOST_VIEWS),
             ("size", 16, MOST_SIDE),
             ("steps", 1, MOST_SAMPLING_STEPS),
+            ("film_size", 16, MOST_SIDE),
+            ("photo_size", 16, MOST_SIDE),
+            ("iterations", 1, MOST_TRAINING_STEPS),
         ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
             require_between(name, value or least, least, most)
+        if not 0 < self.minutes <= _MOST_MINUTES:
+            raise ValueError(f"minutes: expected above 0 and at most {_MOST_MINUTES}, got {self.minutes:g}")
         if not 0 < self.fps <= 240:
             raise ValueError(f"fps: expected between 0 and 240 pictures per second, got {self.fps:g}")
 

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
 from fb_core.files.faults import is_of_the_disk
 from fb_core.fly_through import FoundCameras
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.paths import strided_subset
 from fb_core.json_files import read_json
 
 REPORT_NAME = "report.json"
@@ -32,11 +34,40 @@ KIND = "completed scene"
 """What the folder's mark says."""
 _WRITTEN = {"images", "masks", "raymaps", "transforms.json", "points3D.ply", "fly-through.mp4", "sheet.png", "cameras.png", REPORT_NAME}
 _CHANNELS = tuple(f"{kind}.{axis}" for kind in ("origin", "direction") for axis in "xyz")
-_SHOWN_SIDE = 256
+_SHOWN_SIDE, _TRUST_SIDE = 256, 480
 _MODEL = "PINHOLE"
 _HELD_OUT_EVERY = 8  # photos; with fewer, all are trained on
 _SHEET_COLUMNS, _MOST_SHOWN, _CAPTION = 8, 48, 20
 _logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmFiles:
+    """A film's frames as files of a folder."""
+
+    folder: Path
+    """Where they lie."""
+    cameras: Pinholes
+    """One for each frame, in the photos' world."""
+    splats: Path
+    """The Gaussians that it shows, a PLY file."""
+
+    def picture(self, number: int) -> Path:
+        """What the splats look like."""
+        return self.folder / f"{number:04d}.png"
+
+    def trust(self, number: int) -> Path:
+        """What of it was seen, made up, or is empty."""
+        return self.folder / f"{number:04d}-trust.png"
+
+    def told(self, number: int) -> Path:
+        """JSON file with the shares of the frame that are seen, generated and empty."""
+        return self.folder / f"{number:04d}.json"
+
+    def pictures(self, *, trust: bool = False, longest_side: int | None = None) -> Iterator[Float[Tensor, "3 h w"]]:
+        """The frames (or their pictures of trust), one after the other."""
+        for number in range(len(self.cameras)):
+            yield media.shrink(media.read_image(self.trust(number) if trust else self.picture(number)), longest_side)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +76,14 @@ class NewViews:
 
     images: Float[Tensor, "n 3 s s"]
     """RGB in [0, 1]."""
+    masks: Float[Tensor, "n 1 s s"] | None = None
+    """1 where the picture is to be trained on; None is everywhere."""
     cameras: Pinholes
     """Square, in the photos' world."""
     origins: list[dict[str, Any]]
     """What each frame says of where it came from."""
+    film: FilmFiles | None = None
+    """The film of the scene's splats; None where the generated views are the film."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +121,12 @@ def write_folder(
         _draw(folder / "cameras.png", photos, found, new, points)
     _write_raymaps(folder / "raymaps", photos, found)
     _write_sheet(folder / "sheet.png", photos, left_out, found, new)
-    if new is not None:
+    if new is not None and new.film is None:
         write_film(folder / "fly-through.mp4", new.images, frames_per_second=fps)
+    elif new is not None and new.film is not None:
+        write_film(folder / "fly-through.mp4", new.film.pictures(), frames_per_second=fps)
+        write_film(folder / "trust.mp4", new.film.pictures(trust=True, longest_side=_TRUST_SIDE), frames_per_second=fps)
+        shutil.copyfile(new.film.splats, folder / "splats.ply")
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
@@ -124,7 +163,7 @@ def _write_capture(folder: Path, photos: list[Photo], found: FoundCameras, new: 
     (folder / "images").mkdir()
     trusted = found.trusted
     masks = [photos[index].load_mask() for index in trusted]
-    masked = any(bool((mask < 1).any()) for mask in masks)
+    masked = any(bool((mask < 1).any()) for mask in masks) or (new is not None and new.masks is not None and bool((new.masks < 1).any()))
     frames = []
     for place, (index, mask) in enumerate(zip(trusted, masks, strict=True)):
         photo, camera = photos[index], found.camera(index)
@@ -181,13 +220,17 @@ def _generated_frames(folder: Path, new: NewViews, taken: set[str], masked: bool
         frames.append(
             Frame(
                 image_path=folder / "images" / f"{name}.png",
-                mask_path=_write_mask(folder, name, new.images[index][:1] * 0 + 1) if masked else None,
+                mask_path=_write_mask(folder, name, _mask_of(new, index)) if masked else None,
                 camera=new.cameras[index],
                 camera_model=_MODEL,
                 extra={"generated": True, **origin},
             )
         )
     return frames
+
+
+def _mask_of(new: NewViews, index: int) -> Float[Tensor, "1 h w"]:
+    return new.images[index][:1] * 0 + 1 if new.masks is None else new.masks[index]
 
 
 def _write_mask(folder: Path, name: str, mask: Float[Tensor, "1 h w"]) -> Path:
@@ -205,7 +248,8 @@ def _draw(path: Path, photos: list[Photo], found: FoundCameras, new: NewViews | 
     trusted = found.trusted
     pictures = [photos[index].load(_SHOWN_SIDE) for index in trusted]
     try:
-        draw_cameras(path, [found.camera(index) for index in trusted], pictures, new=None if new is None else new.cameras, points=points)
+        path_of_new = None if new is None else new.cameras if new.film is None else new.film.cameras
+        draw_cameras(path, [found.camera(index) for index in trusted], pictures, new=path_of_new, points=points)
     except (ImportError, RuntimeError, OSError) as error:
         if is_of_the_disk(error):
             raise
@@ -230,12 +274,27 @@ def _write_sheet(path: Path, photos: list[Photo], left_out: dict[str, str], foun
         _strip("Photos with a camera", [photos[index] for index in trusted], [""] * len(trusted)),
         _strip("Photos left out", [photos[index] for index in others], [found.registration.verdicts[index] for index in others]),
     ]
-    count = 0 if new is None else len(new.images)
-    if new is not None:
-        strips.append(Strip(heading=f"New views along the path ({count})", pictures=list(new.images)))
-    title = f"{len(trusted)} of {len(photos) + len(left_out)} photos with a camera, {count} new views"
+    told = f"{0 if new is None else len(new.images)} new views"
+    if new is not None and new.film is not None:
+        strips += _film_strips(new.film)
+        told = f"a film of {len(new.film.cameras)} pictures, {told} generated"
+    elif new is not None:
+        strips.append(Strip(heading=f"New views along the path ({len(new.images)})", pictures=list(new.images)))
+    title = f"{len(trusted)} of {len(photos) + len(left_out)} photos with a camera, {told}"
     subtitle = {"known": "cameras were given", "model": "cameras by the model", "features": "cameras by features"}[found.method]
     write_contact_sheet(path, strips, title=title, subtitle=subtitle, columns=_SHEET_COLUMNS)
+
+
+def _film_strips(film: FilmFiles) -> list[Strip]:
+    """Frames with what of each is seen and made up, and the pictures of that; equally spaced ones where there are many."""
+    chosen = strided_subset(len(film.cameras), _MOST_SHOWN // 2)
+    shares = [read_json(film.told(number)) for number in chosen]
+    captions = [f"seen {100 * share['seen']:.0f} %, made up {100 * share['generated']:.0f} %" for share in shares]
+    frames, trust = ([media.shrink(media.read_image(of(number)), _SHOWN_SIDE) for number in chosen] for of in (film.picture, film.trust))
+    return [
+        Strip(heading=f"Film of the splats ({len(chosen)} of {len(film.cameras)})", pictures=frames, captions=captions),
+        Strip(heading="The same: grey is seen, orange made up by the model, purple empty", pictures=trust),
+    ]
 
 
 def _strip(heading: str, photos: list[Photo], verdicts: list[str]) -> Strip:

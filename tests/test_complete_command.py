@@ -32,7 +32,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d
 from method_configs import commands, complete_command, complete_output
 
-QUICK = ("--views", 5, "--steps", 1, "--no-check")
+QUICK = ("--frames", "model", "--views", 5, "--steps", 1, "--no-check")
 
 
 @pytest.fixture(scope="module")
