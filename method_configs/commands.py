@@ -32,6 +32,7 @@ from method_configs.masked_evaluation import Masked, Paper
 from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
+from method_configs.trust_evaluation import Trust
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
 
@@ -308,6 +309,7 @@ def evaluate(
         | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
         | Annotated[Masked, tyro.conf.subcommand("masked")]
         | Annotated[Designs, tyro.conf.subcommand("designs")]
+        | Annotated[Trust, tyro.conf.subcommand("trust")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms."""
