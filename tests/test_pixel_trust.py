@@ -141,9 +141,9 @@ class Fades(Knows):
         return dataclasses.replace(right, images=right.images + 0.2 * away[:, None].sqrt() * noise)
 
 
-def turning_photos(step: float) -> list[CapturedView]:
-    """Twelve pictures of a coloured sphere, so many degrees apart."""
-    cameras = turned(*[step * number for number in range(12)])
+def turning_photos(step: float, count: int = 12) -> list[CapturedView]:
+    """Pictures of a coloured sphere, so many degrees apart."""
+    cameras = turned(*[step * number for number in range(count)])
     images = 0.5 + 0.5 * torch.sin(3 * cameras.directions()).movedim(-1, 1)
     return [CapturedView(image=image, known=torch.ones(1, 16, 16), camera=cameras[[at]]) for at, image in enumerate(images)]
 
@@ -162,10 +162,10 @@ def test_a_model_that_errs_far_from_what_is_known_is_believed_less_there() -> No
     assert float(trust.curve.error(far).mean()) > float(trust.curve.error(near).mean())
 
 
-@pytest.mark.parametrize(("step", "parts"), [(8.0, True), (30.0, False)])
-def test_where_views_overlap_much_parts_of_the_scene_are_hidden_from_all_of_them(step: float, parts: bool) -> None:
+@pytest.mark.parametrize(("step", "count", "parts"), [(8.0, 12, True), (90.0, 4, False)])
+def test_where_views_overlap_much_parts_of_the_scene_are_hidden_from_all_of_them(step: float, count: int, parts: bool) -> None:
     """Hiding a view alone would hide nothing that others do not show, and nothing could be learned about what nobody has seen."""
-    context = turning_photos(step)
+    context = turning_photos(step, count)
     model = Knows(context)
     trust = measured_trust(context, model, CONFIG, size=16, surroundings=in_a_room)
     (asked,) = model.asked
@@ -175,7 +175,7 @@ def test_where_views_overlap_much_parts_of_the_scene_are_hidden_from_all_of_them
     for look in towards[:, 8, 8]:  # what is hidden from one is hidden from all that look there
         near = (towards @ look) > math.cos(math.radians(4))
         lost += bool(near.any()) and not bool(known[near].any())
-    assert lost > 0
+    assert lost > 0 or not parts
     touched = int((~known).flatten(1).any(dim=1).sum())
     assert (touched > trust.hidden) == parts, "halves of as many views are hidden in any case"
     assert trust.value == 1.0 and trust.model < 1e-10, "what is hidden of the scene does not spoil the comparison of views"
@@ -210,7 +210,7 @@ def test_pixels_of_no_trust_have_no_gradient_and_change_nothing() -> None:
     assert bool((gradient[:, :16] == 0).all()) and bool((gradient[:, 16:] != 0).any())
     other = {"image": batch["image"].clone(), "mask": batch["mask"]}
     other["image"][:, :16] = 0.123
-    assert float(model.get_loss_dict(outputs, other | {"trust": trust})["main_loss"]) == pytest.approx(loss.item())
+    assert float(model.get_loss_dict(outputs, other | {"trust": trust})["main_loss"].detach()) == pytest.approx(loss.item())
     assert float(model.get_loss_dict(outputs, batch | {"trust": 0 * trust})["main_loss"]) == 0
 
 
