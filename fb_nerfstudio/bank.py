@@ -27,7 +27,11 @@ class Bank:
     @staticmethod
     def of(views: CompletedViews, device: torch.device | str) -> Bank:
         """The bank of these views."""
-        shares = views.masks.double().mean(dim=(1, 2, 3)) * torch.tensor([origin.trust for origin in views.origins], dtype=torch.float64)
+        if views.trust is not None:
+            shares = (views.masks * (views.trust.double() / 255)).mean(dim=(1, 2, 3))
+        else:
+            believed = torch.tensor([origin.trust for origin in views.origins], dtype=torch.float64)
+            shares = views.masks.double().mean(dim=(1, 2, 3)) * believed
         return Bank(views=views, cameras=to_nerfstudio(views.cameras, device), shares=tuple(shares.tolist()))
 
     def probability(self, *, most: float, captured: int) -> float:
@@ -43,11 +47,18 @@ class Bank:
         return int(draws.choice(len(self.views), p=np.array(self.shares) / sum(self.shares)))
 
     def batch(self, index: int, *, as_float: bool, weight: float) -> tuple[Cameras, dict[str, Any]]:
-        """Camera and batch of one view on the training's device; ``weight`` is that of a view's loss that is wholly believed."""
-        weight *= self.views.origins[index].trust
+        """Camera and batch of one view on the training's device; ``weight`` is that of a view's loss that is wholly believed.
+
+        ``trust`` ([h, w, 1], 0 to 1), where it is known, weighs every pixel; else that of the whole view is part of ``view_weight``.
+        """
         device, image = self.cameras.device, self.views.images[index]
         image = (image.float() / 255 if as_float else image).to(device)
-        return self.cameras[index : index + 1], {"image": image, "mask": self.views.masks[index].to(device), "view_weight": weight}
+        batch = {"image": image, "mask": self.views.masks[index].to(device), "view_weight": weight}
+        if self.views.trust is None:
+            batch["view_weight"] *= self.views.origins[index].trust
+        else:
+            batch["trust"] = self.views.trust[index].to(device).float() / 255
+        return self.cameras[index : index + 1], batch
 
 
 def without_requested(views: CompletedViews | None) -> tuple[CompletedViews | None, CompletedViews | None]:

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from fb_core.data.captures import Frame
-from fb_core.data.media import resize
+from fb_core.data.captures import TRUST_KEY, Frame
+from fb_core.data.media import read_image, resize
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import wholly_known
 from fb_nerfstudio.completed_views import BROUGHT, CompletedViews, Origin
@@ -48,11 +48,13 @@ def brought_views(frames: Sequence[Frame], *, number: int, size: int | None = No
     side = size or max(max(image.shape[1:]) for image, _, _ in loaded)
     pictures, cameras = zip(*(_fitted(torch.cat([image, mask]), camera, side) for image, mask, camera in loaded), strict=True)
     views = torch.stack(pictures)
+    trusts = [_trust(frame, side) for frame in frames]
     return CompletedViews(
         images=rearrange((views[:, :3].clamp(0, 1) * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous(),
         masks=rearrange(views[:, 3:] > 0, "n 1 h w -> n h w 1").contiguous(),
         cameras=Pinholes.cat(list(cameras)),
         origins=tuple(_origin(frame, number) for frame in frames),
+        trust=None if all(told is None for told, _ in trusts) else torch.stack([whole if told is None else told for told, whole in trusts]),
     )
 
 
@@ -62,6 +64,20 @@ def _fitted(picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int) -> tup
     pads = (left, side - width - left, top, side - height - top)
     fitted = torch.cat(wholly_known(picture[:3], picture[3:], lambda channels: resize(channels, height, width)))
     return F.pad(fitted, pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
+
+
+def _trust(frame: Frame, side: int) -> tuple[UInt8[Tensor, "side side 1"] | None, UInt8[Tensor, "side side 1"]]:
+    """The trust of each pixel where the frame names a picture of it that can be read, and that of the whole view."""
+    whole = torch.full((side, side, 1), round(255 * _origin(frame, 0).trust), dtype=torch.uint8)
+    told = frame.extra.get(TRUST_KEY)
+    root = frame.image_path.parent.parent
+    if not isinstance(told, str) or not (root / told).resolve().is_relative_to(root.resolve()) or not (root / told).is_file():
+        return None, whole
+    picture = read_image(root / told)[:1]
+    left, top, width, height = fitted_rectangle(picture.shape[1], picture.shape[2], side)
+    pads = (left, side - width - left, top, side - height - top)
+    fitted = F.pad(resize(picture, height, width).clamp(0, 1), pads)
+    return (fitted * 255).round().to(torch.uint8).movedim(0, -1).contiguous(), whole
 
 
 def _origin(frame: Frame, number: int) -> Origin:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,12 @@ class Candidates:
     """What of the scene is seen: of a room its walls, of an object its sides."""
     sides: Bool[Tensor, "c k"] | None = None
     """Which sides of an object each of them shows; None in rooms, where the lens decides."""
+    unseen_by_capture: float = 0.0
+    """Share of the surroundings that the captured pictures alone do not show."""
+
+    def also_seen(self, seen: Bool[Tensor, "k"]) -> Candidates:
+        """The same views, where more of the scene is seen."""
+        return dataclasses.replace(self, coverage=dataclasses.replace(self.coverage, seen=self.coverage.seen | seen))
 
     def shown(self, half_angle_radians: float) -> Bool[Tensor, "c k"]:
         """What each of them shows, with a lens of half that opening."""
@@ -49,7 +56,12 @@ def looking_out(places: Float[Tensor, "p 3"], shape: CaptureShape, coverage: Cov
     directions = sphere_directions(_DIRECTIONS, like=shape.up)
     steepest = math.sin(math.radians(max_pitch_degrees)) + 1.001 / _DIRECTIONS
     directions = directions[directions[:, 2].abs() <= steepest] @ axes
-    return Candidates(centers=places.repeat_interleave(len(directions), dim=0), looks=directions.repeat(len(places), 1), coverage=coverage)
+    return Candidates(
+        centers=places.repeat_interleave(len(directions), dim=0),
+        looks=directions.repeat(len(places), 1),
+        coverage=coverage,
+        unseen_by_capture=coverage.unseen_share,
+    )
 
 
 def looking_in(places: Float[Tensor, "p 3"], shape: CaptureShape, cameras: Sequence[Pinholes]) -> Candidates:
@@ -58,11 +70,13 @@ def looking_in(places: Float[Tensor, "p 3"], shape: CaptureShape, cameras: Seque
     captured = F.normalize(torch.cat([camera.centers for camera in cameras]) - shape.focus, dim=1)
     seen = (from_middle @ captured.T > SIDE_SEEN).any(dim=1)
     weight = torch.ones(len(places), dtype=places.dtype)
+    coverage = Coverage(surface=shape.focus + from_middle * shape.radius, weight=weight, seen=seen)
     return Candidates(
         centers=places,
         looks=-from_middle,
-        coverage=Coverage(surface=shape.focus + from_middle * shape.radius, weight=weight, seen=seen),
+        coverage=coverage,
         sides=from_middle @ from_middle.T > SIDE_SEEN,
+        unseen_by_capture=coverage.unseen_share,
     )
 
 

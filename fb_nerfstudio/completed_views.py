@@ -71,11 +71,15 @@ class CompletedViews:
     """OpenCV axes; the images' size."""
     origins: tuple[Origin, ...]
     """One for each view."""
+    trust: UInt8[Tensor, "n h w 1"] | None = None
+    """How far each pixel is believed, 255 wholly (:mod:`fb_nerfstudio.pixel_trust`); None where only the whole view's trust is known."""
 
     def __post_init__(self) -> None:
         count, height, width, _ = self.images.shape
         told = {"masks": tuple(self.masks.shape[:3]), "cameras": (len(self.cameras), self.cameras.height, self.cameras.width)}
         told["origins"] = (len(self.origins), height, width)
+        if self.trust is not None:
+            told["trust"] = tuple(self.trust.shape[:3])
         for name, got in told.items():
             if got != (count, height, width):
                 raise ValueError(f"CompletedViews: expected {name} for {(count, height, width)} like the images, got {got}")
@@ -91,13 +95,22 @@ class CompletedViews:
             masks=self.masks[index],
             cameras=self.cameras[index],
             origins=tuple(self.origins[i] for i in index),
+            trust=None if self.trust is None else self.trust[index],
         )
 
+    @property
+    def pixel_trust(self) -> UInt8[Tensor, "n h w 1"]:
+        """The trust of every pixel, that of the whole view where no other is known."""
+        if self.trust is not None:
+            return self.trust
+        each = torch.tensor([round(255 * origin.trust) for origin in self.origins], dtype=torch.uint8)
+        return each[:, None, None, None].expand(self.masks.shape).to(self.masks.device).contiguous()
+
     def believed(self, trust: float | None) -> CompletedViews:
-        """The same views, believed so far; None leaves them as they are."""
+        """The same views, each believed so far in all its pixels; None leaves them as they are."""
         if trust is None:
             return self
-        return dataclasses.replace(self, origins=tuple(dataclasses.replace(origin, trust=trust) for origin in self.origins))
+        return dataclasses.replace(self, trust=None, origins=tuple(dataclasses.replace(origin, trust=trust) for origin in self.origins))
 
     @property
     def rounds(self) -> list[int]:
@@ -111,11 +124,13 @@ class CompletedViews:
     @staticmethod
     def cat(groups: Sequence[CompletedViews]) -> CompletedViews:
         """All views. Raises ValueError when the sizes differ."""
+        known = any(group.trust is not None for group in groups)
         return CompletedViews(
             cameras=Pinholes.cat([group.cameras for group in groups]),
             images=torch.cat([group.images for group in groups]),
             masks=torch.cat([group.masks for group in groups]),
             origins=tuple(origin for group in groups for origin in group.origins),
+            trust=torch.cat([group.pixel_trust for group in groups]) if known else None,
         )
 
     def state(self) -> dict[str, Any]:
@@ -124,6 +139,7 @@ class CompletedViews:
             "version": _STATE_VERSION,
             "images": self.images.cpu(),
             "masks": self.masks.cpu(),
+            "trust": None if self.trust is None else self.trust.cpu(),
             "camera_to_world": self.cameras.camera_to_world.cpu(),
             "focal": self.cameras.focal.cpu(),
             "principal": self.cameras.principal.cpu(),
@@ -147,7 +163,8 @@ class CompletedViews:
             height=state["height"],
         )
         origins = tuple(Origin(**origin) for origin in state["origins"])
-        return CompletedViews(images=state["images"], masks=state["masks"], cameras=cameras, origins=origins)
+        trust = state.get("trust")  # runs of earlier versions have none
+        return CompletedViews(images=state["images"], masks=state["masks"], cameras=cameras, origins=origins, trust=trust)
 
     def save_capture(self, folder: Path | Target) -> Capture:
         """Write the views as a capture folder (transforms.json, images, masks where they are not whole), replacing an earlier one.
@@ -158,6 +175,7 @@ class CompletedViews:
         target = folder if isinstance(folder, Target) else views_target(folder)
         images = self.images.cpu().permute(0, 3, 1, 2).float() / 255
         masks = self.masks.cpu().permute(0, 3, 1, 2).float()
+        trust = None if self.trust is None else self.trust.cpu().permute(0, 3, 1, 2).float() / 255
         cameras = self.cameras.to("cpu", torch.float64)
         whole = bool(self.masks.all())
         frames = [
@@ -165,6 +183,7 @@ class CompletedViews:
                 name=f"{origin.role}_{origin.round:02d}_{index:04d}",
                 image=images[index],
                 mask=None if whole else masks[index],
+                trust=None if trust is None else trust[index],
                 camera=cameras[index],
                 extra={"generated": True, **dataclasses.asdict(origin)},
             )

@@ -84,6 +84,10 @@ class CompletionConfig:
     """Views generated together in each of these rounds."""
     least_gain: float = 0.003
     """Where the capture decides (`anchor_views` None): share of what it has not seen that a further view must show, from 0 to 1."""
+    least_round_gain: float = 0.02
+    """The same, of a whole round after the first, from 0 to 1: where it would show less, there is no further round."""
+    rounds_apart: int = 100
+    """Where the capture decides: training steps between two rounds, so that the next one is planned by what the splats show by then."""
     camera_path: Path | None = None
     """Camera path saved in nerfstudio's viewer (Render tab): generate these views, where they are, instead of placing cameras."""
     film_path: Path | None = None
@@ -141,6 +145,7 @@ class CompletionConfig:
             ("anchor_views", 0, MOST_VIEWS),
             ("densify_rounds", 0, MOST_VIEWS),
             ("densify_views", 0, MOST_VIEWS),
+            ("rounds_apart", 0, MOST_TRAINING_STEPS),
             ("steps", 1, MOST_SAMPLING_STEPS),
             ("window", 1, MOST_VIEWS),
         ):
@@ -163,8 +168,9 @@ class CompletionConfig:
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         require_between("completion.image_size", self.image_size or 16, 16, MOST_SIDE)
-        if not 0.0 <= self.least_gain <= 1.0:
-            raise ValueError(f"completion.least_gain: expected a share from 0 to 1, got {self.least_gain}")
+        for name in ("least_gain", "least_round_gain"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"completion.{name}: expected a share from 0 to 1, got {getattr(self, name)}")
         if not 0.0 <= self.generated_share <= 1.0:
             raise ValueError(f"completion.generated_share: expected a probability from 0 to 1, got {self.generated_share}")
         if not 0.0 < self.strength <= 1.0:

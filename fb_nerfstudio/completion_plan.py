@@ -65,6 +65,18 @@ class PlannedRound:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Former:
+    """What the plan of one round has to know of those before it."""
+
+    number: int
+    """Of the round to plan, from 0."""
+    cameras: tuple[Pinholes, ...] = ()
+    """Of the generated views so far, one each."""
+    shown: tuple[Bool[Tensor, "_h _w"], ...] = ()
+    """Their pixels that count as seen; masks of any size."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompletionPlan:
     """All that is decided before the model runs."""
 
@@ -81,7 +93,8 @@ class CompletionPlan:
     size: int
     """Side of all views in pixels while they are generated."""
     covered: tuple[float, float] | None = None
-    """Share of what surrounds the capture that its pictures show, and that they and the new views show; None where nobody asked."""
+    """Share of what surrounds the capture that its pictures (and generated views so far) show, and that the new views show besides; None
+    where nobody asked."""
 
     @property
     def new_views(self) -> int:
@@ -109,6 +122,7 @@ def plan_completion(
     *,
     size: int,
     known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
+    former: Former | None = None,
 ) -> CompletionPlan:
     """Choose context views and new cameras.
 
@@ -123,6 +137,7 @@ def plan_completion(
         config: numbers of views, placement, seed.
         size: side of the generated views in pixels.
         known: of each captured picture its known part (a mask of any size, None for all of it); without, all of them are known.
+        former: where the capture decides, plan the one round that follows these; None plans all rounds at once.
     """
     cameras = [camera.to("cpu", torch.float64) for camera in cameras]  # a scene may lie far from the origin
     shape = CaptureShape.of(cameras)
@@ -134,7 +149,7 @@ def plan_completion(
     if config.camera_path is not None:
         rounds = _path_rounds(config, size)
     elif config.anchor_views is None:
-        rounds, covered = _needed_rounds(site, context, config, size)
+        rounds, covered = _needed_rounds(site, context, config, size, former)
     else:
         rounds = _placed_rounds(site, context, config, size)
     if config.context_choice == "overlap":
@@ -176,26 +191,31 @@ def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig
 
 
 def _needed_rounds(
-    site: _Site, context: Sequence[int], config: CompletionConfig, size: int
+    site: _Site, context: Sequence[int], config: CompletionConfig, size: int, former: Former | None
 ) -> tuple[list[PlannedRound], tuple[float, float]]:
     """The views that show most of what the capture does not, none that adds too little: anchors, then rounds of what is left.
 
+    After former rounds it is one round of what these have left, and none where that would add too little.
     Also returns the shares of what surrounds the capture that are seen before and after.
     """
     half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
-    places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)))
+    places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)), former)
     if config.film_path is not None:
         places = with_path(places, read_camera_path(config.film_path, size=size).cameras, site.shape)
+    sizes = dict(enumerate([config.most_anchors] + [config.densify_views] * config.densify_rounds))
+    if former is not None:
+        sizes = {former.number: sizes.get(former.number, 0)}
+    # Shares are of what the capture alone has not seen, so that no round becomes dear because little is left.
+    left = places.coverage.unseen_share
+    more = max(1.0, places.unseen_by_capture / left) if left > 0 else 1.0
     chosen = choose_views(
-        places.coverage,
-        places.shown(half_angle),
-        most=config.most_anchors + config.densify_rounds * config.densify_views,
-        least_gain=config.least_gain,
+        places.coverage, places.shown(half_angle), most=sum(sizes.values()), least_gain=min(1.0, more * config.least_gain)
     )
     taken = list(chosen.indices)
-    sizes = [config.most_anchors] + [config.densify_views] * config.densify_rounds
+    if former is not None and former.number > 0 and sum(chosen.gains) < config.least_round_gain * more * left:
+        taken = []
     rounds, first = [], 0
-    for number, views in enumerate(sizes):
+    for number, views in sizes.items():
         group = taken[first : first + views]
         first += views
         if not group:
@@ -206,7 +226,7 @@ def _needed_rounds(
         new, seed = new.to(torch.float32), round_seed(config.seed, number)
         role = ANCHOR if number == 0 else DENSIFY
         rounds.append(PlannedRound(number=number, role=role, seed=seed, cameras=new, prompt=config.prompt))
-    return rounds, (1 - places.coverage.unseen_share, 1 - chosen.unseen_share)
+    return rounds, (1 - left, 1 - chosen.unseen_share if taken else 1 - left)
 
 
 def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:
@@ -294,8 +314,8 @@ class _Site:
             return self.shell
         return sphere(self.shape.center, _BEYOND * float((standing - self.shape.center).norm(dim=1).max()))
 
-    def candidates(self, generator: torch.Generator) -> Candidates:
-        """Places and directions for new views, and what of the scene is seen."""
+    def candidates(self, generator: torch.Generator, former: Former | None = None) -> Candidates:
+        """Places and directions for new views, and what of the scene is seen by the capture and by former views."""
         chosen = spread_subset(self.cameras, _CAPTURED_PLACES)
         standing = torch.cat([self.cameras[index].centers for index in chosen])
         around = [self.centers(role, _PLACES, generator) for role in (ANCHOR, DENSIFY)]
@@ -303,8 +323,18 @@ class _Site:
             surface, directions = self.surface()
             weight = 1.0 - 0.6 * (directions @ self.shape.up) ** 2  # as `need`
             coverage = Coverage.of(self.cameras, surface, weight, self.known)
-            return looking_out(torch.cat([standing, *around]), self.shape, coverage, max_pitch_degrees=self.placement.max_pitch_degrees)
-        return looking_in(torch.cat(around), self.shape, self.cameras)
+            places = looking_out(torch.cat([standing, *around]), self.shape, coverage, max_pitch_degrees=self.placement.max_pitch_degrees)
+            return places if former is None else places.also_seen(seen_by(self._of(former), surface, former.shown))
+        places = looking_in(torch.cat(around), self.shape, self.cameras)
+        whole = (
+            []
+            if former is None
+            else [camera for camera, mask in zip(self._of(former), former.shown, strict=True) if mask.float().mean() > 0.5]
+        )
+        return places.also_seen(looking_in(torch.cat(around), self.shape, whole).coverage.seen) if whole else places
+
+    def _of(self, former: Former) -> list[Pinholes]:
+        return [camera.to("cpu", torch.float64) for camera in former.cameras]
 
     def targets(
         self, centers: Float[Tensor, "n 3"], need: Float[Tensor, "k"], half_angle_radians: float, generator: torch.Generator

@@ -40,6 +40,7 @@ from fb_nerfstudio.going_on import CaptureIdentity
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
+from fb_nerfstudio.next_round import Rounds, due_after, former_of, in_turn
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
 from fb_nerfstudio.requests import (
     CompleteFrom,
@@ -53,7 +54,8 @@ from fb_nerfstudio.requests import (
     without_view,
 )
 from fb_nerfstudio.start_points import start_points
-from fb_nerfstudio.trust import measured_trust
+from fb_nerfstudio.trust import Trust, measured_trust
+from fb_nerfstudio.trusted_views import surroundings_of
 from fb_nerfstudio.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
 from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
@@ -114,7 +116,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: Bank | None = None
         self._finished = False
-        self._trust: float | None = None  # in the model on this capture, once it is measured
+        self._trust: Trust | None = None  # in the model on this capture, once it is measured
+        self._rounds = Rounds()  # how far rounds are that are planned one after the other
         self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
         self._given_up: set[int] = set()  # those of them that could not be generated
         self.at_work = False
@@ -182,7 +185,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
 
     def _complete_when_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         completion = self.config.completion
-        if not completion.enabled or self._finished or step < completion.at_step:
+        if not completion.enabled or self._finished or step < max(completion.at_step, self._rounds.due):
             return
         trainer: Any = attributes.trainer
         if hasattr(trainer, "generation_begins"):  # not every trainer is ours
@@ -194,7 +197,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         """Bring all generated views together: those that the capture brings along, and what is to be generated."""
         brought = self._brought_frames if takes_brought(self.config.completion) else []
         if not brought or self.config.completion.on_completed_capture == "extend":
-            self._generate(attributes, step)
+            while (due := self._generate(attributes, step)) is not None:
+                if due > step:  # the splats are trained on this round before the next one is planned
+                    return save_checkpoint(attributes.trainer, step)
         if brought:  # last, in one step with the end: a run that goes on takes them once
             self._take(brought, attributes, step)
         self._finished = True
@@ -218,8 +223,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._save_bank(attributes.trainer)
         CONSOLE.print(f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen regions.")
 
-    def _generate(self, attributes: TrainingCallbackAttributes, step: int) -> None:
-        """Generate all rounds that are missing; each is kept in the bank, in the run's folder and in a checkpoint at once."""
+    def _generate(self, attributes: TrainingCallbackAttributes, step: int) -> int | None:
+        """Generate the rounds that are due and missing; each is kept in the bank, in the run's folder and in a checkpoint at once.
+
+        Returns the step before which the next round is due, None where there is none.
+        """
         started = time.perf_counter()
         config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
         model, cameras = self._load_inpainter(), self.captured_cameras()
@@ -231,7 +239,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         if inpaints:
             plan = plan_inpainting(cameras, points, config, size=size)
         else:
-            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts)
+            done, _ = without_requested(self.generated_views)
+            one = former_of(done, splats, self._rounds.number, trained=step >= TRAINED_STEPS) if in_turn(config) else None
+            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts, former=one)
             if plan.covered is not None and step >= TRAINED_STEPS:
                 plan = needed_by_splats(plan, splats, cameras, self.known_parts)
         done, _ = without_requested(self.generated_views)
@@ -244,29 +254,55 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             if config.inpainter == "diffusion":
                 CONSOLE.print(f"The model's matrix products: {in_words(config.precision, self.device)}.")
             context = LazyViews(lambda index: self.captured_view(index, cameras[index]), plan.context)
-            left = len(plan.rounds) - (0 if done is None else len(done.rounds))
+            left = sum(done is None or one.number not in done.rounds for one in plan.rounds)
             with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
                 if config.trust == "measured" and not inpaints and self._trust is None:
-                    trust = measured_trust([*context], model, config, size=size, cache=open_cache(config), on_step=bars.trial)
-                    self._trust = trust.value
-                    CONSOLE.print(trust.in_words)
-                    if trust.hidden:  # a kill in the first round costs that round, not the trial too
+                    around = surroundings_of(plan.shell, splats, trained=step >= TRAINED_STEPS)
+                    self._trust = measured_trust(
+                        [*context], model, config, size=size, cache=open_cache(config), on_step=bars.trial, surroundings=around
+                    )
+                    CONSOLE.print(self._trust.in_words)
+                    if self._trust.hidden:  # a kill in the first round costs that round, not the trial too
                         save_checkpoint(trainer, step)
                 for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
                     left -= 1
-                    self._set_bank(merged(self.generated_views, (), views.believed(self._trust)))
+                    self._set_bank(merged(self.generated_views, (), self._believed(views)))
                     if left > 0:
                         save_checkpoint(trainer, step)
         del model
         release_memory()
-        done, requested = without_requested(self.generated_views)
-        if done is not None:
-            done, added = self._fitted_in(done, attributes, plan.shell, cameras, step)
-            self._set_bank(done if requested is None else CompletedViews.cat([done, requested]))
+        turns = in_turn(config)
+        new, other = self._to_fit_in(plan)
+        if new is not None:
+            new, added = self._fitted_in(new, attributes, plan.shell, cameras, step)
+            self._set_bank(new if other is None else CompletedViews.cat([*([other] if turns else []), new, *([] if turns else [other])]))
+        due = None
+        if turns:
+            trains_until = None if trainer is None else trainer._start_step + trainer.config.max_num_iterations
+            due = due_after(config, self._rounds, plan, self._trust, step=step, last=trains_until)
+            self._rounds = self._rounds.after(plan, step=step, due=step if due is None else due)
+        if new is not None:
             folder = self._save_bank(trainer)
             where = "" if folder is None else f", saved in {folder}"
             seconds = time.perf_counter() - started
-            CONSOLE.print(f"{len(done)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
+            CONSOLE.print(f"{len(new)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
+        return due
+
+    def _to_fit_in(self, plan: CompletionPlan) -> tuple[CompletedViews | None, CompletedViews | None]:
+        """The generated views that are new to the splats, and all others: of rounds in turn those of this plan, else all automatic ones."""
+        done, requested = without_requested(self.generated_views)
+        if done is None or not in_turn(self.config.completion):
+            return done, requested
+        numbers = {one.number for one in plan.rounds}
+        bank = self.generated_views
+        assert bank is not None  # done is a part of it
+        mine = [place for place, origin in enumerate(bank.origins) if origin.round in numbers]
+        rest = [place for place in range(len(bank)) if place not in set(mine)]
+        return (bank[mine] if mine else None), (bank[rest] if rest else None)
+
+    def _believed(self, views: CompletedViews) -> CompletedViews:
+        """The views, believed as far as the model is, once that is measured."""
+        return views.believed(None if self._trust is None else self._trust.value)
 
     def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Do what was asked for in the viewer, one request before each iteration, whole or not at all.
@@ -369,7 +405,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         release_memory()
         if self.generated_views is not None and planned.replaces:
             self._forget(self.generated_views[planned.replaces], planned.done, cameras, attributes)
-        new, added = self._fitted_in(new.believed(self._trust), attributes, scene.shell, cameras, step, holes_only=True)
+        new, added = self._fitted_in(self._believed(new), attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
         said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
@@ -427,6 +463,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             known=self.known_parts,
             trained=step >= TRAINED_STEPS,
             holes_only=holes_only,
+            curve=None if self._trust is None else self._trust.curve,
         )
 
     # ----------------------------------------------------------------------------------------------------- persistence
@@ -458,7 +495,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             "views": None if self.generated_views is None else self.generated_views.state(),
             "finished": self._finished,
             "outdated": list(self._outdated),
-            "trust": self._trust,
+            "trust": None if self._trust is None else self._trust.value,
+            "measured": None if self._trust is None else self._trust.state(),
+            "rounds": self._rounds.state(),
             "start_points": self._own_points,
             "captured_draws": self.captured_draws,
             "capture": CaptureIdentity.of(self.train_dataparser_outputs).state(),
@@ -469,8 +508,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._finished = bool(state["finished"])
         self.captured_draws = int(state["captured_draws"])
         self._outdated = [int(number) for number in state.get("outdated", ())]
-        self._trust = None if state.get("trust") is None else float(state["trust"])
+        self._trust = None if state.get("measured") is None else Trust.from_state(state["measured"])
         if state.get("start_points") is not None:  # not triangulated again: interrupted rounds are planned from the very same points
             self._own_points = state["start_points"].cpu()
             self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
+        self._rounds = Rounds.from_state(state.get("rounds"), without_requested(self.generated_views)[0])

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fb_core.data import media
-from fb_core.data.captures import Capture, Frame, split_lists, splits_of, write_transforms
+from fb_core.data.captures import TRUST_KEY, Capture, Frame, split_lists, splits_of, write_transforms
 from fb_core.data.colmap_model import ColmapImage, write_colmap
 from fb_core.data.own_files import own_pictures, own_points
 from fb_core.data.points import Points, copy_points, read_points, write_points
@@ -106,6 +106,10 @@ def _generated_frames(completed: CompletedCapture, folder: Path, *, masked: bool
         if masked:
             media.write_image(_mask_path(target), views.masks[index].movedim(-1, 0).float())
         extra = {"generated": True, **dataclasses.asdict(origin)}
+        if views.trust is not None:
+            extra[TRUST_KEY] = f"trust/{target.stem}.png"
+            (folder / "trust").mkdir(exist_ok=True)
+            media.write_image(folder / extra[TRUST_KEY], views.trust[index].movedim(-1, 0).float() / 255)
         mask_path = _mask_path(target) if masked else None
         frames.append(Frame(image_path=target, mask_path=mask_path, camera=views.cameras[index], camera_model=_MODEL, extra=extra))
     return frames

@@ -16,6 +16,8 @@ from fb_core.geometry.shell import Shell
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.completion_plan import CompletionPlan
+from fb_nerfstudio.pixel_trust import Curve
+from fb_nerfstudio.trusted_views import with_pixel_trust
 from fb_nerfstudio.unseen import (
     SOLID,
     coarse,
@@ -40,6 +42,7 @@ def fitted_in(
     known: Sequence[Bool[Tensor, "_h _w"] | None],
     trained: bool,
     holes_only: bool = False,
+    curve: Curve | None = None,
 ) -> tuple[CompletedViews, int]:
     """Match colours, mask, and place Gaussians for what the capture has not seen.
 
@@ -53,16 +56,18 @@ def fitted_in(
         known: of each captured picture its known part.
         trained: whether the splats' depth and opacity are to be believed.
         holes_only: place Gaussians only where no splats are.
+        curve: from what speaks for and against a pixel to its trust; None leaves the trust of the views as it is.
 
     Returns the views as they are to be trained on, and the number of new Gaussians.
     """
     if config.task == "inpaint":  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
         return views, 0
     places = config.seed_gaussians and hasattr(splats, "add_gaussians")
-    if not places and config.generated_pixels == "all":
+    if not places and config.generated_pixels == "all" and curve is None:
         return views, 0
     rendered = render_geometry(splats, coarse(views.cameras)) if trained else None
     unseen = find_unseen(views.cameras, captured, shell, rendered, known)
+    views = with_pixel_trust(views, unseen, rendered, shell, curve)
     if config.match_colors and rendered is not None:
         views = with_matched_colors(views, unseen, rendered)
     if config.generated_pixels == "unseen":

@@ -356,15 +356,19 @@ class FillerbusterSplatModel(SplatfactoModel):
     def get_loss_dict(self, outputs: dict[str, Tensor], batch: dict[str, Any], metrics_dict: Any = None) -> dict[str, Tensor]:
         """Splatfacto's losses over known pixels (``batch["mask"]``, 1 = known) and the normal losses from their step on.
 
-        ``batch["view_weight"]`` (default 1) multiplies what this view contributes, not the regularisers of the scene.
+        ``batch["view_weight"]`` (default 1) multiplies what this view contributes, ``batch["trust"]`` (default 1) what each of its pixels
+        does; neither touches the regularisers of the scene.
         """
         config, known, weight = self.config, self._known(batch), batch.get("view_weight", 1.0)
-        target, rgb = self._target(outputs, batch), outputs["rgb"]
-        main = (1 - config.ssim_lambda) * photometric.l1(rgb, target, known)
+        target, rgb, trust = self._target(outputs, batch), outputs["rgb"], self._trust(batch)
+        main = (1 - config.ssim_lambda) * photometric.l1(rgb, target, known, trust)
         if config.ssim_lambda > 0:
-            main = main + config.ssim_lambda * (1 - photometric.ssim(rgb, target, known))
+            main = main + config.ssim_lambda * photometric.dissimilarity(rgb, target, known, trust)
         losses = {"main_loss": weight * main, "scale_reg": self._scale_regularization()}
         if self.training and self._normals_wanted():
+            if trust is not None:  # losses of normals are means over what counts: of so much of it, by so much weight
+                mean, known = photometric.known_mean(trust, known), trust if known is None else known * trust
+                weight = weight * mean
             losses |= {name: weight * value for name, value in self._normal_losses(outputs, known).items()}
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
@@ -406,6 +410,10 @@ class FillerbusterSplatModel(SplatfactoModel):
         if tuple(mask.shape[:2]) != size:
             raise ValueError(f"batch['mask']: expected the image's size {size}, got {tuple(mask.shape[:2])}")
         return self._downscale_if_required(mask.reshape(*size, 1).float()).to(self.device)
+
+    def _trust(self, batch: dict[str, Any]) -> Float[Tensor, "h w 1"] | None:
+        """How far the batch's pixels are believed, at the current resolution; None where wholly."""
+        return self._downscale_if_required(batch["trust"].float()).to(self.device) if "trust" in batch else None
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from method_configs.methods_benchmark import Methods
 from method_configs.model_evaluation import ModelOnCaptures
 from method_configs.scaling_evaluation import Scaling
 from method_configs.scene_evaluation import Scene
+from method_configs.trust_evaluation import Trust
 from method_configs.uncalibrated_evaluation import Uncalibrated
 
 
@@ -333,6 +334,7 @@ def evaluate(
         | Annotated[Masked, tyro.conf.subcommand("masked")]
         | Annotated[Designs, tyro.conf.subcommand("designs")]
         | Annotated[Scene, tyro.conf.subcommand("scene")]
+        | Annotated[Trust, tyro.conf.subcommand("trust")]
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""

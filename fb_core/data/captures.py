@@ -39,6 +39,8 @@ from fb_core.files.ownership import Target
 from fb_core.files.whole import settled, whole_file, whole_folder
 from fb_core.geometry.cameras import Pinholes
 
+TRUST_KEY = "trust_path"
+"""Of a generated frame: the picture of its pixels' trust, relative to the capture's folder."""
 FRAME_KEYS = ("file_path", "mask_path", "transform_matrix", *INTRINSIC_KEYS)
 CAPTURE_KEYS = ("frames", "ply_file_path", *INTRINSIC_KEYS)
 _ORIENTATIONS = ("pca", "up", "vertical", "none")  # nerfstudio's
@@ -156,6 +158,8 @@ class FrameToWrite:
     """RGB in [0, 1]; stored with 8 bits."""
     mask: Float[Tensor, "1 h w"] | None = None
     """1 = used; values below one half become 0. None = all used."""
+    trust: Float[Tensor, "1 h w"] | None = None
+    """How far each pixel of a generated picture is believed, 0 to 1; stored with 8 bits in trust/NAME.png, which the frame names."""
     camera: Pinholes
     """One camera of the image's size, OpenCV axes."""
     extra: dict[str, Any] = field(default_factory=dict)
@@ -409,4 +413,9 @@ def _write_frame(frame: FrameToWrite, folder: Path, with_mask: bool) -> Frame:
         mask_path.parent.mkdir(exist_ok=True)
         mask = torch.ones_like(frame.image[:1]) if frame.mask is None else frame.mask
         media.write_image(mask_path, (mask >= 0.5).to(frame.image))
-    return Frame(image_path=image_path, mask_path=mask_path if with_mask else None, camera=frame.camera, extra=frame.extra)
+    extra = frame.extra
+    if frame.trust is not None:
+        extra = {**extra, TRUST_KEY: f"trust/{frame.name}.png"}
+        (folder / "trust").mkdir(exist_ok=True)
+        media.write_image(folder / extra[TRUST_KEY], frame.trust)
+    return Frame(image_path=image_path, mask_path=mask_path if with_mask else None, camera=frame.camera, extra=extra)
