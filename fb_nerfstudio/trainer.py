@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.files.faults import telling
-from fb_core.files.whole import unfinished_beside, whole_file
+from fb_core.files.whole import swept, unfinished_beside, whole_file
 from fb_core.interruption import stop_on_signals
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
 
@@ -100,6 +100,7 @@ class FillerbusterTrainer(Trainer):
         if folder is not None:
             given = max(folder.glob("step-*.ckpt")) if step is None else folder / f"step-{step:09d}.ckpt"
         if given is not None:
+            swept(given.absolute().parent.parent)  # the run's folder, where a kill may have left half a checkpoint
             try:
                 torch.load(given, map_location="cpu", weights_only=True, mmap=True)
             except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:

@@ -22,6 +22,7 @@ from fb_core.data.captures import Frame, read_capture
 from fb_core.data.training_task import Draw, Sequences, TaskConfig, draw_task, stacked, training_frame
 from fb_core.data.transforms_json import JSON_NAME
 from fb_core.data.undistort import straight_camera
+from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import raymaps_of
 from fb_core.masks import wholly_known
@@ -56,7 +57,7 @@ def find_captures(folder: Path) -> list[Path]:
 
     Raises ValueError if there is none.
     """
-    found = sorted(path.parent for path in Path(folder).rglob(JSON_NAME)) if Path(folder).is_dir() else []
+    found = sorted(path.parent for path in found_below(folder, JSON_NAME)) if Path(folder).is_dir() else []
     if not found:
         raise ValueError(f"captures: expected folders with a {JSON_NAME} at or below {folder}, found none; check the path")
     return found
