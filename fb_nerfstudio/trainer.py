@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.files.faults import telling
-from fb_core.files.whole import unfinished_beside, whole_file
+from fb_core.files.whole import swept, unfinished_beside, whole_file
 from fb_core.interruption import stop_on_signals
 from fb_nerfstudio.generation import refusing
 from fb_nerfstudio.going_on import check_capture, check_options_beside_a_file, check_shapes, checkpoint_of, parsed, read_checkpoint
@@ -174,6 +174,7 @@ class FillerbusterTrainer(Trainer):
         with refusing():
             path = checkpoint_of(config)
             if path is not None:
+                swept(path.absolute().parent.parent)  # the run's folder, where a kill may have left half a checkpoint
                 read_checkpoint(path)
         try:
             config.load_checkpoint, config.load_dir = path, None

@@ -401,7 +401,13 @@ def _stop(error: BaseException, sentence: str, code: int) -> None:
 
 
 def _show_log() -> None:
-    """Our own messages from INFO upwards, other packages' from WARNING upwards, on stderr in rich's manner."""
+    """Our own messages from INFO upwards, other packages' from WARNING upwards, on stderr in rich's manner.
+
+    What packages tell each other of their future (FutureWarning) is nothing that a user can mend.
+    """
+    import warnings
+
+    warnings.simplefilter("ignore", FutureWarning)
     from rich.console import Console
     from rich.logging import RichHandler
 

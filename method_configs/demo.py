@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from fb_core.files.ownership import MARK_NAME, Target, mark_text
-from fb_core.files.whole import remove_folder, whole_file
+from fb_core.files.whole import remove_folder, swept, whole_file
 from fb_core.machine import usable_cores
 from method_configs.earlier_runs import clear_run
 from method_configs.training_process import TrainingProcess
@@ -146,6 +146,7 @@ def _render_both(output: Path, bars: _Bars) -> dict[str, HeldOutViews]:
 
 def _clear(output: Path, *, inputs: tuple[Path, ...] = ()) -> None:
     """Make the folder, empty but for the marker; only an earlier demo is removed, and nothing in it that no demo makes."""
+    swept(output)
     Target(folder=output, kind="demo", overwrite=True, inputs=inputs, earlier=_is_earlier_demo).check()
     with whole_file(output / MARKER) as unfinished:
         unfinished.write_text(mark_text("demo", []), encoding="utf-8")

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from fb_core.files.whole import swept
+
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
@@ -45,7 +47,7 @@ def read_run(run: Path) -> tuple[Any, dict[str, Any]]:
     Raises ValueError when there is no run in the folder, when its config.yml names anything but what a run of ours is made of (as a run
     of another method does), and when it has no checkpoint yet or a broken one.
     """
-    path = _latest_checkpoint(run)
+    path = _latest_checkpoint(swept(run))
     import torch
 
     from fb_nerfstudio.run_config import read_run_config

@@ -15,8 +15,8 @@ import pytest
 
 from fb_core.files import whole
 from fb_core.files.faults import CannotWrite
-from fb_core.files.ownership import Target, foreign_files, kind_of
-from fb_core.files.whole import remove_folder, settled, unfinished_beside, whole_file, whole_folder
+from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of
+from fb_core.files.whole import found_below, remove_folder, settled, swept, unfinished_beside, whole_file, whole_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -280,3 +280,106 @@ def test_a_file_by_way_of_a_missing_folder_is_the_file_that_is_there(tmp_path: P
     with whole_file(tmp_path / "missing" / ".." / "precious.png") as unfinished:
         unfinished.write_text("new")
     assert precious.read_text() == "new" and sorted(path.name for path in tmp_path.iterdir()) == ["precious.png", "sheet.png"]
+
+
+def left_behind(place: Path, *, old: str | None = None, new: str | None = None) -> Path:
+    """What a killed process leaves of a writing to a place."""
+    work = place.parent / f".{place.name}.unfinished-0badcafe"
+    work.mkdir(parents=True)
+    (work / "owner").touch()
+    for name, text in (("old", old), ("new", new)):
+        if text is not None:
+            write(work / name, text)
+    return work
+
+
+def test_a_folder_with_nothing_but_what_kills_left_is_free(tmp_path: Path):
+    """The failing case: a folder that looked empty to people was refused as somebody else's."""
+    folder = tmp_path / "out"
+    left_behind(folder / "a.json")
+    left_behind(folder / "model", new="half")
+    with whole_folder(Target(folder=folder, kind="test")):
+        pass
+    assert names(folder) == [MARK_NAME] and names(tmp_path) == ["out"]
+    left_behind(folder / "sheet.png")  # is no file of somebody else either
+    write(folder, "newer")
+    assert content(folder) == "newer" and names(tmp_path) == ["out"]
+
+
+def test_sweeping_puts_right_what_kills_left_and_spares_all_else(tmp_path: Path):
+    left_behind(tmp_path / "model", old="old", new="new")
+    left_behind(tmp_path / "gone", new="half")
+    stranger = tmp_path / ".notes.unfinished-0badcafe"
+    stranger.mkdir()
+    (stranger / "thesis.txt").write_text("years of work")
+    (tmp_path / ".link.unfinished-0badcafe").symlink_to(stranger)
+    with unfinished_beside(tmp_path / "live") as work:
+        (work / "half").touch()
+        assert swept(tmp_path) == tmp_path
+        assert (work / "half").exists()
+    assert names(tmp_path) == [".link.unfinished-0badcafe", stranger.name, "model"] and content(tmp_path / "model") == "old"
+    assert (stranger / "thesis.txt").exists() and swept(tmp_path / "missing") == tmp_path / "missing"
+
+
+def test_searches_find_nothing_that_is_unfinished(tmp_path: Path):
+    """Neither captures nor meshes nor shards: half a capture would be trained on, or the same one twice."""
+    write(tmp_path / "deep" / "scene", "whole")
+    left_behind(tmp_path / "deep" / "scene", old="old", new="half")
+    left_behind(tmp_path / "other", new="half")
+    for folder in (tmp_path, tmp_path / "deep", tmp_path / "deep" / "scene"):
+        (found,) = found_below(folder, "two")
+        assert found == tmp_path / "deep" / "scene" / "below" / "two"
+    inside = tmp_path / ".odd.unfinished-0badcafe" / "scene"  # who names such a folder means it
+    write(inside, "whole")
+    assert found_below(inside, "two") == [inside / "below" / "two"]
+
+
+KILLED_REPAIR = """
+import os, shutil, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from fb_core.files import whole
+from test_whole_files import content, left_behind, names, write
+root, stands, ends = Path(sys.argv[2]), sys.argv[3], set()
+for moment in range(200):
+    place = root / str(moment) / "out"
+    left_behind(place, old="old", new="new")
+    (place.parent / ".out.unfinished-0badcafe" / "old" / "mine.txt").write_text("mine")
+    if stands == "another folder":
+        write(place.parent / "third", "third")
+        os.rename(place.parent / "third", place)
+    child = os.fork()
+    if child == 0:
+        steps = []
+        def counted(function):
+            def step(*args, **kwargs):
+                if len(steps) == moment:
+                    os._exit(9)
+                steps.append(function)
+                return function(*args, **kwargs)
+            return step
+        for name in ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"):
+            setattr(os, name, counted(getattr(os, name)))
+        whole.swept(place.parent)
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in (0, 9), code
+    ends.add(code)
+    whole.swept(place.parent)
+    expected = ["out", "out.replaced-1"] if stands == "another folder" else ["out"]
+    assert names(place.parent) == expected, (moment, names(place.parent))
+    (place.parent / expected[-1] / "mine.txt").unlink()  # which must be there
+    assert content(place) == ("third" if stands == "another folder" else "old"), moment
+    assert content(place.parent / expected[-1]) == "old", moment
+    if code == 0:
+        break
+assert ends == {0, 9} and moment >= 4, (ends, moment)
+"""
+
+
+@pytest.mark.parametrize("stands", ["nothing", "another folder"])
+def test_a_kill_during_the_repair_is_repaired(tmp_path: Path, stands: str):
+    """A swap was interrupted, and then, at each of its steps, the repair: the old folder comes back with all that was put into it."""
+    done = subprocess.run([sys.executable, "-c", KILLED_REPAIR, str(ROOT / "tests"), str(tmp_path), stands], cwd=ROOT,
+                          capture_output=True, text=True, timeout=300)  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]

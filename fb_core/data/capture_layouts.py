@@ -21,6 +21,7 @@ from fb_core.data.colmap_lenses import lens_of
 from fb_core.data.colmap_model import rotations_of
 from fb_core.data.colmap_reader import ColmapPose, has_model, model_size, points_file, read_model
 from fb_core.data.transforms_json import JSON_NAME
+from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 from fb_core.json_files import read_json
 
@@ -74,7 +75,7 @@ def read_layout(layout: Layout) -> Capture:
 
 def layouts_below(folder: Path) -> list[Path]:
     """Every folder at or below this one that holds a capture, sorted; a capture's own COLMAP model is not another one."""
-    files = {name: sorted(folder.rglob(name)) for name in (JSON_NAME, *BLENDER_NAMES, "cameras.bin", "cameras.txt")}
+    files = {name: found_below(folder, name) for name in (JSON_NAME, *BLENDER_NAMES, "cameras.bin", "cameras.txt")}
     found = {path.parent for path in files[JSON_NAME]}
     found |= {path.parent for name in BLENDER_NAMES for path in files[name]}
     for path in (*files["cameras.bin"], *files["cameras.txt"]):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data.capture_sequences import CaptureConfig, TrainingCapture, Window, find_captures, read_training_capture, strided
+from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 
 _logger = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ def capture_folders(data: Path) -> list[Path]:
 
 def looks_like(folder: Path) -> tuple[str, str]:
     """What a folder without captures seems to be, and what turns it into one."""
-    files = [path for path in sorted(folder.rglob("*"))[:10_000] if path.is_file()]
+    files = [path for path in found_below(folder, "*")[:10_000] if path.is_file()]
     names, suffixes = {path.name for path in files}, {path.suffix.lower() for path in files}
     if names & {"cameras.bin", "cameras.txt"}:
         return "a part of a COLMAP model", "copy its files images and cameras (both .bin, or both .txt) beside one another"

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 
 from fb_core.data.mesh_pictures import Lighting, draw_with_caster, draw_with_pyvista, read_mesh
 from fb_core.data.sequences import Encode, Rendered, ViewPool
+from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 from fb_core.sampling.randomness import generator_of
 
@@ -98,7 +99,7 @@ class MeshPool(ViewPool):
 
 def find_meshes(folder: Path) -> list[Path]:
     """Every mesh file at or below a folder, sorted. Raises ValueError if there is none."""
-    found = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in _SUFFIXES) if Path(folder).is_dir() else []
+    found = [path for path in found_below(folder, "*") if path.suffix.lower() in _SUFFIXES] if Path(folder).is_dir() else []
     if not found:
         raise ValueError(f"meshes: expected files of {', '.join(_SUFFIXES)} at or below {folder}, found none; check the path")
     return found

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 
+from fb_core.files.whole import found_below
 from fb_core.sampling.randomness import generator_of
 
 _logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ def find_shards(place: str) -> list[str]:
     """
     folder = Path(place)
     if folder.is_dir():
-        found = sorted(str(path) for path in folder.rglob("*.tar"))
+        found = [str(path) for path in found_below(folder, "*.tar")]
     else:
         from braceexpand import braceexpand
 

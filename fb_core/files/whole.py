@@ -17,6 +17,7 @@ import ctypes
 import errno
 import logging
 import os
+import re
 import secrets
 import shutil
 import time
@@ -36,6 +37,7 @@ _OWNER, _NEW, _OLD, _GONE = "owner", "new", "old", "gone"
 _OWNER_TEXT = "fillerbuster writes here; the folder may be removed once no fillerbuster runs\n"
 _AT_THIS_FOLDER, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _NO_SUCH_STEP = {errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EXDEV}
+_HIDDEN = re.compile(r"\.(.+)\.unfinished-[0-9a-f]{8}")
 _PATIENCE_SECONDS = 2.0  # far more than a live process needs between two renames
 _logger = logging.getLogger(__name__)
 
@@ -51,7 +53,7 @@ def whole_folder(target: Target) -> Iterator[Path]:
     CannotWrite in one sentence when the disk is full or cannot be written.
     """
     folder = real_place(target.folder)
-    settled(folder)
+    swept(settled(folder))
     target.check()
     with unfinished_beside(folder) as work:
         new = work / _NEW
@@ -129,7 +131,7 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
 def remove_folder(target: Target) -> None:
     """Take away an earlier folder of the target's kind, if there is one, in one step. Raises as :func:`whole_folder`."""
     folder = real_place(target.folder)
-    settled(folder)
+    swept(settled(folder))
     target.check()
     if folder.exists():
         discard(folder, foreign=foreign_files(folder))
@@ -157,6 +159,24 @@ def settled(path: Path) -> Path:
             break
         time.sleep(0.01)
     return path
+
+
+def swept(folder: Path) -> Path:
+    """The folder itself, without what killed processes have left of writings to places in it: that is put right and removed."""
+    try:
+        with os.scandir(folder) as entries:
+            works = [(one.name, told[1]) for one in entries if (told := _HIDDEN.fullmatch(one.name)) and one.is_dir(follow_symlinks=False)]
+    except OSError:
+        return folder
+    for name, place in sorted(works):
+        _clean_up(folder / name, folder / place)
+    return folder
+
+
+def found_below(folder: Path, pattern: str) -> list[Path]:
+    """Files and folders at or below a folder, sorted, but none that is still being written, or was when a process was killed."""
+    found = sorted(Path(folder).rglob(pattern))
+    return [path for path in found if not any(_HIDDEN.fullmatch(part) for part in path.relative_to(folder).parts)]
 
 
 # ---- changing places ------------------------------------------------------------------------------------------------
