@@ -31,9 +31,9 @@ from fb_core.data import media
 from fb_core.data.captures import Capture, Frame, read_capture
 from fb_core.data.points import read_points
 from fb_core.data.transforms_json import DISTORTION_KEYS
-from fb_core.data.undistort import FISHEYE_MODELS
+from fb_core.data.undistort import FISHEYE_MODELS, is_too_wide, straight_camera
 from fb_nerfstudio.bridge import flip_axes
-from fb_nerfstudio.pictures import SMALLER_BY
+from fb_nerfstudio.pictures import SMALLER_BY, WIDE_LENSES, Lens
 
 _ONE_PLACE = 1e-6  # of the largest coordinate, in single precision: what it cannot tell apart
 _FAR_OFF = 1000.0  # spreads from the origin: beyond, single precision rounds poses by more than a ten thousandth of the spread
@@ -84,6 +84,8 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         photos = [place for place, frame in enumerate(frames) if not frame.generated and not frame.is_bad]
         chosen = self._chosen(capture, frames, photos, split)
         files = [self._file(frames[place].image_path, capture, "images_") for place in chosen]
+        wide = {str(path): _lens_of(frames[place]) for place, path in zip(chosen, files, strict=True) if _is_wide(frames[place])}
+        frames = [_straight(frame) if _is_wide(frame) else frame for frame in frames]
         masks = [frames[place].mask_path for place in chosen]
         scale, applied = world.scale, capture.extra.get("applied_transform")
         transform = world.transform
@@ -106,6 +108,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
                 "depth_unit_scale_factor": self.config.depth_unit_scale_factor,
                 "mask_color": self.config.mask_color,
                 **self._made_smaller(files, [frames[place].image_path for place in chosen], capture),
+                **({WIDE_LENSES: wide} if wide else {}),
                 **points,
             },
         )
@@ -266,6 +269,21 @@ def _sizes_on_disk(cameras: Cameras, frames: list[Frame], files: list[Path]) -> 
         cameras.width[index], cameras.height[index] = width, height
         cameras.fx[index], cameras.fy[index] = camera.focal[0]
         cameras.cx[index], cameras.cy[index] = camera.principal[0]
+
+
+def _is_wide(frame: Frame) -> bool:
+    """Whether nerfstudio cannot straighten a frame's picture, so that it is straightened while it is read."""
+    return is_too_wide(frame.camera, frame.camera_model, frame.distortion)
+
+
+def _lens_of(frame: Frame) -> Lens:
+    return frame.camera, frame.camera_model, frame.distortion
+
+
+def _straight(frame: Frame) -> Frame:
+    """The frame as a pinhole camera took it."""
+    camera = straight_camera(frame.camera, frame.camera_model, frame.distortion)
+    return dataclasses.replace(frame, camera=camera, camera_model="PINHOLE", distortion={})
 
 
 def _name(path: Path) -> str:

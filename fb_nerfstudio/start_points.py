@@ -23,6 +23,7 @@ from fb_core.geometry.triangulation import Features, detect, triangulate
 from fb_core.masks import wholly_known
 from fb_nerfstudio.bridge import to_pinholes
 from fb_nerfstudio.completion_plan import shell_of
+from fb_nerfstudio.pictures import WIDE_LENSES, straightened
 
 _SIDE = 960  # pixels of the longer side in which features are sought
 _MODELS = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: "OPENCV_FISHEYE"}
@@ -71,7 +72,11 @@ class _Photo:
         if outputs.mask_filenames is not None:
             mask = read_mask(outputs.mask_filenames[index], apply_orientation=turned)
             masks.append(F.interpolate(mask[None], size=image.shape[1:])[0])  # masks may be larger than a small copy of their picture
+        wide = outputs.metadata.get(WIDE_LENSES, {}).get(str(path))
         known = torch.stack([(mask >= 0.5).to(image) for mask in masks]).amin(dim=0) if masks else torch.ones_like(image[:1])
+        if wide is not None:
+            image, known = straightened(image, known, wide)
+            masks.append(known)
         image, known = wholly_known(image, known, lambda channels: resize(channels, height, width))
         camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)
         return cls(image, known if masks else None, camera, *lens)

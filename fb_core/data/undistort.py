@@ -1,9 +1,15 @@
-"""Straight pictures from lenses that bend: undistortion with OpenCV's lens models (the models that nerfstudio trains on)."""
+"""Straight pictures from lenses that bend: undistortion with OpenCV's lens models (the models that nerfstudio trains on).
+
+No plane holds a picture of 180 degrees: fisheye lenses that see farther than ``WIDEST_FISHEYE`` off their axis are straightened to 140
+degrees at most, and what lies beyond is left out.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,9 +22,14 @@ from fb_core.masks import wholly_known
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+WIDEST_FISHEYE = 86.0
+"""Degrees off the axis, at the middle of a picture's side, up to which OpenCV finds the straight camera of a fisheye lens."""
+_KEPT = 70.0  # degrees off the axis at the middle of a side, of a picture from a wider lens
 _FOCAL_RATIOS = (0.05, 20.0)  # of straight cameras over bent ones, for lenses that exist
 _WIDEST = 3.0  # tangent of the angle off the axis up to which a perspective lens is looked at (72 degrees)
+_TABLE, _STEPS = 4096, 4  # angles that the inverse of a fisheye starts from, and steps of Newton from there
 _TOUCHES_NOTHING = 1 - 1e-4  # OpenCV knows 32 places within a pixel: a neighbour weighs at least 1 / 1024
+_logger = logging.getLogger(__name__)
 
 
 def check_lens(camera_model: str, distortion: dict[str, float], where: str) -> None:
@@ -76,6 +87,8 @@ def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, f
     import cv2
 
     size = (camera.width, camera.height)
+    if is_too_wide(camera, camera_model, distortion):
+        return _capped(camera, distortion)
     if camera_model in FISHEYE_MODELS:
         lens = _fisheye_lens(distortion)
         matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(_matrix(camera), lens, size, np.eye(3), balance=0)
@@ -84,6 +97,55 @@ def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, f
     values = torch.from_numpy(np.asarray(matrix, dtype=np.float64))
     focal, principal = torch.stack([values[0, 0], values[1, 1]])[None], values[None, :2, 2] + 0.5
     return dataclasses.replace(camera, focal=focal.to(camera.focal), principal=principal.to(camera.principal))
+
+
+def is_too_wide(camera: Pinholes, camera_model: str, distortion: dict[str, float]) -> bool:
+    """Whether a fisheye lens sees so far that a straight picture of all of it would be infinitely large, or nearly so."""
+    return camera_model in FISHEYE_MODELS and max(_side_angles(camera, distortion)) > math.radians(WIDEST_FISHEYE)
+
+
+def _side_angles(camera: Pinholes, distortion: dict[str, float]) -> tuple[float, float]:
+    """Angles off the axis (radians) of the farther of the left and the right side's middle, and of the upper and the lower one's."""
+    (focal_x, focal_y), (center_x, center_y) = camera.focal[0].tolist(), camera.principal[0].tolist()
+    bent = [max(center_x, camera.width - center_x) / focal_x, max(center_y, camera.height - center_y) / focal_y]
+    across, along = _fisheye_angles(torch.tensor(bent, dtype=torch.float64), distortion).tolist()
+    return across, along
+
+
+def _capped(camera: Pinholes, distortion: dict[str, float]) -> Pinholes:
+    """A pinhole camera along the lens's axis with square pixels that sees 70 degrees off it at most, to the middle of a side."""
+    across, along = _side_angles(camera, distortion)
+    _say_capped(round(2 * math.degrees(max(across, along))))
+    kept = math.radians(_KEPT)
+    focal = max(side / 2 / math.tan(min(angle, kept)) for side, angle in ((camera.width, across), (camera.height, along)))
+    middle = [camera.width / 2, camera.height / 2]
+    return dataclasses.replace(camera, focal=camera.focal.new_full((1, 2), focal), principal=camera.principal.new_tensor([middle]))
+
+
+@lru_cache
+def _say_capped(degrees: int) -> None:
+    """Once for every lens."""
+    _logger.warning("a fisheye lens of %d degrees is straightened to %g degrees; what lies beyond is left out", degrees, 2 * _KEPT)
+
+
+def _fisheye_angles(bent: Float[Tensor, "m"], distortion: dict[str, float]) -> Float[Tensor, "m"]:
+    """Angles off the axis (radians) of distances from it on a fisheye's picture of focal length 1; those that the lens has no angle for
+    get the largest that it has."""
+    powers = torch.tensor([1.0, *(distortion.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))], dtype=torch.float64)
+
+    def lens(angles: Tensor) -> Tensor:
+        return sum((k * angles ** (2 * power + 1) for power, k in enumerate(powers.tolist())), torch.zeros_like(angles))
+
+    table = torch.linspace(0, math.pi, _TABLE, dtype=torch.float64)
+    values = lens(table)
+    falls = (values.diff() <= 0).nonzero()
+    last = int(falls[0]) if len(falls) else _TABLE - 1
+    found = torch.from_numpy(np.interp(bent.double().numpy(), values[: last + 1].numpy(), table[: last + 1].numpy()))
+    reached = bent.double().clamp(max=float(values[last]))
+    for _ in range(_STEPS):
+        slope = sum(((2 * power + 1) * k * found ** (2 * power) for power, k in enumerate(powers.tolist())), torch.zeros_like(found))
+        found = (found - (lens(found) - reached) / slope.clamp(min=1e-3)).clamp(0, float(table[last]))
+    return found
 
 
 def check_straight(camera: Pinholes, camera_model: str, distortion: dict[str, float], where: str) -> None:
@@ -149,10 +211,13 @@ def straight_directions(
 
     if len(points) == 0:
         return points.new_zeros(0, 3)
+    if camera_model in FISHEYE_MODELS:  # OpenCV ends at 90 degrees
+        flat = (points.double() - camera.principal.double()) / camera.focal.double()
+        length = flat.norm(dim=1)
+        angles = _fisheye_angles(length, distortion)
+        outwards = flat / length.clamp(min=1e-12)[:, None] * angles.sin()[:, None]
+        return torch.cat([outwards, angles.cos()[:, None]], dim=1).to(points.dtype)
     bent = (points.double() - 0.5).numpy()[:, None]
-    if camera_model in FISHEYE_MODELS:
-        plane = cv2.fisheye.undistortPoints(bent, _matrix(camera), _fisheye_lens(distortion))
-    else:
-        plane = cv2.undistortPoints(bent, _matrix(camera), _perspective_lens(distortion))
+    plane = cv2.undistortPoints(bent, _matrix(camera), _perspective_lens(distortion))
     directions = torch.nn.functional.pad(torch.from_numpy(plane.reshape(-1, 2)), (0, 1), value=1.0)
     return torch.nn.functional.normalize(directions, dim=-1).to(points.dtype)
