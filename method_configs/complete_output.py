@@ -286,10 +286,10 @@ def _write_sheet(path: Path, photos: list[Photo], left_out: dict[str, str], foun
 
 
 def _film_strips(film: FilmFiles) -> list[Strip]:
-    """Frames with what of each is seen and made up, and the pictures of that; equally spaced ones where there are many."""
+    """Frames with what of each photos have seen, and the pictures of that; equally spaced ones where there are many."""
     chosen = strided_subset(len(film.cameras), _MOST_SHOWN // 2)
     shares = [read_json(film.told(number)) for number in chosen]
-    captions = [f"seen {100 * share['seen']:.0f} %, made up {100 * share['generated']:.0f} %" for share in shares]
+    captions = [f"{100 * share['seen']:.0f} % seen" for share in shares]
     frames, trust = ([media.shrink(media.read_image(of(number)), _SHOWN_SIDE) for number in chosen] for of in (film.picture, film.trust))
     return [
         Strip(heading=f"Film of the splats ({len(chosen)} of {len(film.cameras)})", pictures=frames, captions=captions),

@@ -32,6 +32,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import strided_subset
 from fb_core.geometry.similarity import Similarity
 from fb_core.json_files import read_json
+from fb_core.memory import GIB
 from fb_nerfstudio.completed_views import CompletedViews
 from fb_nerfstudio.completion_config import CompletionConfig
 from fb_nerfstudio.scene_film import FilmFrame, film_frame, seen_by_photos
@@ -44,6 +45,7 @@ from method_configs.scene_training import train_scene
 
 _FEATURES_SIDE = 960  # of photos in which features are sought for the first Gaussians
 _GENERATED_SHARE = 0.3  # as ns-train fillerbuster
+_BYTES, _BYTES_TRAINED = 4, 500  # for each pixel of the photos, and of the picture that is trained on
 _LARGE = 1000.0  # spreads off the origin from which single precision moves Gaussians: the file's world is then shifted
 _logger = logging.getLogger(__name__)
 
@@ -164,7 +166,8 @@ def announcement(job: SceneJob, budget: SceneBudget) -> str:
     """One sentence on what is about to be done and how long it may take."""
     size = job.path(budget.film_side)
     along = f"along {Path(job.options.path).name}" if job.options.path.endswith(".json") else f"along the {job.options.path}"
-    memory = 2**30 + 300 * budget.photo_side**2 * 3
+    width, height = job.common_size
+    memory = int(1.3 * GIB) + _BYTES * len(job.photos) * width * height + _BYTES_TRAINED * budget.photo_side**2
     new = ", with new views where no photo shows anything" if job.options.generate else ""
     return (
         f"Training splats of {len(job.photos)} photos of up to {budget.photo_side} pixels for {budget.schedule.steps} steps{new}, "

@@ -87,7 +87,7 @@ class SceneBudget:
         side = min(side, longest)
         if steps is None:
             affordable = _TRAINING_SHARE * seconds / max(training(side, 1), 1e-9)
-            steps = 10 * round(min(max(affordable, FEWEST_STEPS), MOST_STEPS) / 10)
+            steps = int(min(max(affordable, FEWEST_STEPS), MOST_STEPS)) // 10 * 10
         # Splats know no more than the photos that they were trained on: beyond twice that size a film only gets larger.
         film_side = film_side or max([one for one in _SIDES if one <= 2 * side and film(one) <= _FILM_SHARE * seconds] or [_SIDES[0]])
         film_side = min(film_side, longest)

@@ -106,7 +106,8 @@ def test_values_that_are_not_finite_are_left_out() -> None:
 
 
 def test_what_stands_behind_beside_or_under_a_mask_is_not_seen() -> None:
-    splats = blobs([[0.0, 0, 0], [0.0, 1.5, 0], [5.0, 0, 0], [0.0, 0, 1.0]], size=0.3)
+    splats = blobs([[0.0, 0, 0], [0.0, 1.5, 0], [5.0, 0, 0], [0.0, 0, 1.4]], size=0.3)
+    splats.log_scales[1] = math.log(0.05)  # far within what the first one covers
     camera = looking([0.0, -4, 0], [0.0, 0, 0])
     assert seen_by_photos(splats, [camera], [None]).tolist() == [True, False, False, True]  # the second stands behind the first
     upper = torch.zeros(32, 32, dtype=torch.bool)
