@@ -30,6 +30,8 @@ from fb_core.sampling.trajectory import OnStep, SamplingInterrupted
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
+_LATENT_PIXELS = 8  # side of what one latent stands for
+_STARTS = 4  # steps in which a mask between 0 and 1 says when a latent joins the sampling
 _FARTHEST = {"pixels": 1e4, "rays": 1e12}  # known values beyond are no colours or places, and their squares would overflow
 _logger = logging.getLogger(__name__)
 
@@ -288,7 +290,8 @@ class Fillerbuster:
 
     def _encoded(self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
-        images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(current.images, current.image_known)
+        whole = (current.image_known > 0).to(current.image_known)  # a mask below 1 says when a pixel joins, not how dark it is
+        images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(current.images, whole)
         raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps.to(views.raymaps))
         there = views.rays_known.maximum(current.rays_known) > 0
         raymaps = torch.where(there, raymaps, 0.0)
@@ -348,9 +351,17 @@ def _check_current(current: Views, views: Views) -> None:
 
 
 def _counting(current: Views, views: Views) -> Float[Tensor, "n 32 h w"] | None:
-    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones add nothing."""
-    image_known, rays_known = views.image_known.maximum(current.image_known), views.rays_known.maximum(current.rays_known)
-    counts, known = (known_latents(*map(to_latent_grid, k)) for k in ((image_known, rays_known), (views.image_known, views.rays_known)))
+    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones add nothing.
+
+    Where the least known pixel of a latent has a mask between 0 and 1 in the current views it is that, in quarters: it starts in between.
+    """
+    rays_known = views.rays_known.maximum(current.rays_known)
+    known = known_latents(to_latent_grid(views.image_known), to_latent_grid(views.rays_known))
+    there = (views.image_known >= 1).to(current.image_known).maximum(current.image_known)
+    least = -F.max_pool2d(-there, kernel_size=_LATENT_PIXELS)
+    told = (least * _STARTS).floor() / _STARTS
+    rays = (to_latent_grid(rays_known) == 1).to(told)
+    counts = unsplit(*(part.expand(-1, LATENT_CHANNELS, -1, -1).to(known) for part in (told, rays)))
     return None if torch.equal(counts, known) else counts
 
 

@@ -103,14 +103,16 @@ class CompletionConfig:
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says nothing)."""
     guidance_known: float | None = None
     """Guidance scale in known pixels; None is what the model's folder recommends (the paper's 1.1 where it says nothing)."""
-    start: Literal["noise", "render"] = "render"
+    start: Literal["noise", "render", "soft"] = "render"
     """Start generation from noise alone, or, where the splats are opaque (trained for 100 steps at least), from their render noised to the
-    time `strength`. What is asked for in the viewer starts from noise: the splats show what it is to replace."""
+    time `strength`; soft: where they are half opaque, from half way between. What is asked for in the viewer starts from noise: the splats
+    show what it is to replace."""
     strength: float = 0.5
-    """Time from which on the render may change (``start`` render): towards 0 it stays as it is, 1 is noise."""
+    """Time from which on the render may change (``start`` render, soft): towards 0 it stays as it is, 1 is noise."""
     guess: Guess | None = None
-    """How the render enters (``start`` render): as the `start` of the sampling at `strength`, `told` to the model as a guess, or `both`;
-    None is what the model's folder recommends (start where it says nothing). Only models that were trained with guesses understand them."""
+    """How the render enters (``start`` render, soft): as the `start` of the sampling at `strength`, `told` to the model as a guess, or
+    `both`; None is what the model's folder recommends (start where it says nothing). Only models that were trained with guesses
+    understand them."""
     precision: Precision = "auto"
     """Of the model's matrix products: auto is bfloat16 where the machine is faster at it, else that of the weights (float32)."""
     window: int | None = None

@@ -95,6 +95,8 @@ class CompletionPlan:
     covered: tuple[float, float] | None = None
     """Share of what surrounds the capture that its pictures (and generated views so far) show, and that the new views show besides; None
     where nobody asked."""
+    coverage: Coverage | None = None
+    """Points all over what surrounds the capture, and which of them are seen before these rounds; None where nobody asked."""
 
     @property
     def new_views(self) -> int:
@@ -145,11 +147,11 @@ def plan_completion(
     site = _Site(shape=shape, shell=shell_of(shape, points), points=points, cameras=cameras, known=known, placement=config.placement)
     count = config.context_views
     context = strided_subset(len(cameras), count) if config.context_choice == "stride" else spread_subset(cameras, count)
-    covered = None
+    covered = coverage = None
     if config.camera_path is not None:
         rounds = _path_rounds(config, size)
     elif config.anchor_views is None:
-        rounds, covered = _needed_rounds(site, context, config, size, former)
+        rounds, covered, coverage = _needed_rounds(site, context, config, size, former)
     else:
         rounds = _placed_rounds(site, context, config, size)
     if config.context_choice == "overlap":
@@ -163,6 +165,7 @@ def plan_completion(
         rounds=tuple(rounds),
         size=size,
         covered=covered,
+        coverage=coverage,
     )
 
 
@@ -192,11 +195,11 @@ def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig
 
 def _needed_rounds(
     site: _Site, context: Sequence[int], config: CompletionConfig, size: int, former: Former | None
-) -> tuple[list[PlannedRound], tuple[float, float]]:
+) -> tuple[list[PlannedRound], tuple[float, float], Coverage]:
     """The views that show most of what the capture does not, none that adds too little: anchors, then rounds of what is left.
 
     After former rounds it is one round of what these have left, and none where that would add too little.
-    Also returns the shares of what surrounds the capture that are seen before and after.
+    Also returns the shares of what surrounds the capture that are seen before and after, and what is seen before.
     """
     half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
     places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)), former)
@@ -226,7 +229,7 @@ def _needed_rounds(
         new, seed = new.to(torch.float32), round_seed(config.seed, number)
         role = ANCHOR if number == 0 else DENSIFY
         rounds.append(PlannedRound(number=number, role=role, seed=seed, cameras=new, prompt=config.prompt))
-    return rounds, (1 - left, 1 - chosen.unseen_share if taken else 1 - left)
+    return rounds, (1 - left, 1 - chosen.unseen_share if taken else 1 - left), places.coverage
 
 
 def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:

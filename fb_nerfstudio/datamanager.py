@@ -40,10 +40,12 @@ from fb_nerfstudio.going_on import CaptureIdentity
 from fb_nerfstudio.grid_inpainter import GridInpainter
 from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_nerfstudio.lazy_inpainter import LazyInpainter
+from fb_nerfstudio.missing import plan_missing
 from fb_nerfstudio.next_round import Rounds, due_after, former_of, in_turn
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
 from fb_nerfstudio.requests import (
     CompleteFrom,
+    CompleteMissing,
     RegenerateRound,
     RemoveView,
     Request,
@@ -233,8 +235,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         model, cameras = self._load_inpainter(), self.captured_cameras()
         points = self._seen_points(splats, cameras, step)
         inpaints, size = config.task == "inpaint", config.image_size or model.size
-        renders = config.start == "render" and step >= TRAINED_STEPS
-        guess = partial(first_guess, splats) if renders else None
+        renders = config.start != "noise" and step >= TRAINED_STEPS
+        guess = partial(first_guess, splats, soft=config.start == "soft") if renders else None
         generate = run_inpainting if inpaints else partial(run_completion, first_guess=guess)
         if inpaints:
             plan = plan_inpainting(cameras, points, config, size=size)
@@ -245,6 +247,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             if plan.covered is not None and step >= TRAINED_STEPS:
                 plan = needed_by_splats(plan, splats, cameras, self.known_parts)
         done, _ = without_requested(self.generated_views)
+        self.completion_panel.coverage.show(plan)
         if not plan.rounds and plan.covered is not None:
             CONSOLE.print(announcement(plan, config, model))
         if plan.rounds:
@@ -271,6 +274,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                         save_checkpoint(trainer, step)
         del model
         release_memory()
+        self.completion_panel.coverage.generated()
         turns = in_turn(config)
         new, other = self._to_fit_in(plan)
         if new is not None:
@@ -391,13 +395,20 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         gone = seen_by_nobody_else(splats.means, leaving, staying, cameras, self.known_parts)
         return splats.remove_gaussians(gone, attributes.optimizers)
 
-    def _generate_requested(self, request: CompleteFrom | RegenerateRound, attributes: TrainingCallbackAttributes, step: int) -> str:
+    def _generate_requested(
+        self, request: CompleteFrom | CompleteMissing | RegenerateRound, attributes: TrainingCallbackAttributes, step: int
+    ) -> str:
         """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
         started = time.perf_counter()
         config, splats = self.config.completion, splats_of(attributes)
         model, cameras = self._load_inpainter(), self.captured_cameras()
         scene = self._scene(splats, cameras, step, size=config.image_size or model.size)
-        planned = plan_request(request, scene, self.generated_views, cameras, config, self.known_parts)
+        if isinstance(request, CompleteMissing):
+            points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
+            whole, parts = self.generated_views, self.known_parts
+            planned = plan_missing(request, scene, whole, splats, cameras, points, config, parts, trained=step >= TRAINED_STEPS)
+        else:
+            planned = plan_request(request, scene, self.generated_views, cameras, config, self.known_parts)
         context = [self.captured_view(index, cameras[index]) for index in planned.plan.context]
         with Bars(self.completion_panel, 1) as bars:
             (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found)

@@ -49,6 +49,23 @@ class CompleteFrom:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CompleteMissing:
+    """Generate views of what nobody has seen, from where they show most of it."""
+
+    views: int = 8
+    """At most so many."""
+    seed: int = 0
+    """Decides the pictures."""
+    prompt: str = ""
+    """What is to be seen, for models that read text."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.views <= MOST_VIEWS:
+            raise ValueError(f"views: expected 1 to {MOST_VIEWS} views, got {self.views}")
+        _check_seed(self.seed)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RegenerateRound:
     """Generate the views of a round anew, from the same cameras."""
 
@@ -72,7 +89,7 @@ class RemoveView:
     """Which one, see :func:`key_of`: a place in the bank would mean another view after an earlier request."""
 
 
-Request = CompleteFrom | RegenerateRound | RemoveView
+Request = CompleteFrom | CompleteMissing | RegenerateRound | RemoveView
 
 
 class RequestQueue:

@@ -18,7 +18,18 @@ from torch import Tensor
 
 from fb_core.geometry.paths import distances
 from fb_nerfstudio.completed_views import CompletedViews, round_title
-from fb_nerfstudio.requests import MOST_VIEWS, CompleteFrom, RegenerateRound, RemoveView, Request, RequestQueue, key_of, place_of
+from fb_nerfstudio.requests import (
+    MOST_VIEWS,
+    CompleteFrom,
+    CompleteMissing,
+    RegenerateRound,
+    RemoveView,
+    Request,
+    RequestQueue,
+    key_of,
+    place_of,
+)
+from fb_nerfstudio.viewer_coverage import CoverageOverlay, picture_of
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -29,6 +40,7 @@ _SELECTED_COLOR = (255, 60, 60)
 _LARGEST_PICTURE = 128  # pixels; what a frustum shows
 _FRUSTUM_SHARE = 0.15  # size of a frustum, in units of the usual distance between neighbouring cameras
 _ASKING = 1000.0  # place of the buttons in the panel: below all switches
+_OVERLAYS = 2.5  # place of what is drawn over: above the rounds' switches
 _NO_ROUND = "none yet"
 _ENDED = "Training has ended: nothing will be generated any more. To ask for more, go on with --load-dir."
 _PLAIN = "This run trains without new views: nothing will be generated on request."
@@ -59,6 +71,7 @@ class CompletionPanel(ViewerControl):
         self._lock = threading.RLock()  # of all that is said, drawn and selected here: the training draws, clicks select
         self._selected: str | None = None
         self._marker: Any = None
+        self.coverage = CoverageOverlay(self._draw)
 
     @property
     def is_open(self) -> bool:
@@ -77,6 +90,7 @@ class CompletionPanel(ViewerControl):
                 self._status = gui.add_markdown("", order=0)
                 self._progress = gui.add_progress_bar(0.0, visible=False, order=1)
                 self._add_buttons(gui)
+            self.coverage.setup(self.viser_server, self._folder, order=_OVERLAYS)
             self._add_switch("captured", f"Captured ({self.captured})", self._show_captured)
             self._draw()
 
@@ -119,13 +133,15 @@ class CompletionPanel(ViewerControl):
             return
         with self._lock:
             rounds = {} if self.views is None else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
-            told = {name: _told(views) for name, views in rounds.items()}
+            told = {name: (self.coverage.mode, *_told(views)) for name, views in rounds.items()}
             for name in [name for name in self._drawn if self._drawn[name] != told.get(name)]:
                 self._clear_round(name)
             for name, views in rounds.items():
                 if name not in self._drawn:
                     self._draw_round(name, views)
                     self._drawn[name] = told[name]
+            if rounds:
+                self.coverage.offer_pictures()
             self._hidden &= set(rounds)
             self._offer_rounds()
             if place_of(self.views, self._selected or "") is None:
@@ -153,7 +169,7 @@ class CompletionPanel(ViewerControl):
     def _draw_view(self, node: str, views: CompletedViews, index: int) -> Any:
         camera = views.cameras[index]
         stride = max(1, -(-max(camera.width, camera.height) // _LARGEST_PICTURE))
-        color, picture = _COLORS[views.origins[index].round % len(_COLORS)], views.images[index, ::stride, ::stride].cpu().numpy()
+        color, picture = _COLORS[views.origins[index].round % len(_COLORS)], picture_of(views, index, self.coverage.mode, stride)
         handle, key = self._frustum(node, views, index, color=color, image=picture), key_of(views, index)
 
         @handle.on_click
@@ -197,7 +213,8 @@ class CompletionPanel(ViewerControl):
             if self._status is None:
                 return
             count, closed = 0 if self.views is None else len(self.views), self.requests.closed
-            lines = [views_in_words(count, "generated ") if count else "No generated views", closed, self._message]
+            generated = views_in_words(count, "generated ") if count else "No generated views"
+            lines = [generated, self.coverage.in_words, closed, self._message]
             self._status.content = "  \n".join(line for line in lines if line)
             for element in self._asking.values():
                 element.disabled = closed is not None
@@ -220,6 +237,8 @@ class CompletionPanel(ViewerControl):
         hint = "The view from here and its neighbours to both sides."
         add("views", "number", "Views", 1, min=1, max=MOST_VIEWS, step=1, hint=hint)
         add("complete", "button", "Complete from here", hint="Generate from where you stand.").on_click(self._complete_clicked)
+        hint = "As many views as are set above, where they show most of what nobody has seen."
+        add("missing", "button", "Complete what is missing", hint=hint).on_click(self._missing_clicked)
         add("round", "dropdown", "Round", (_NO_ROUND,), hint="Which views to generate anew.")
         add("regenerate", "button", "Regenerate round", hint="The same cameras, another seed.").on_click(self._regenerate_clicked)
         add("look", "button", "Go to selected view", hint="Click a frustum to select it.").on_click(self._look_clicked)
@@ -239,6 +258,11 @@ class CompletionPanel(ViewerControl):
             f"{views_in_words(views)} from here",
             lambda seed, prompt: CompleteFrom(camera_to_world=pose, views=views, seed=seed, prompt=prompt),
         )
+
+    def _missing_clicked(self, _: Any) -> None:
+        views = int(self._asking["views"].value)
+        what = f"at most {views_in_words(views)} of what is missing"
+        self._ask(what, lambda seed, prompt: CompleteMissing(views=views, seed=seed, prompt=prompt))
 
     def _regenerate_clicked(self, _: Any) -> None:
         with self._lock:
@@ -297,7 +321,7 @@ class CompletionPanel(ViewerControl):
             if self.views is not None and place is not None:
                 self._marker = self._frustum(f"{_NODE}/selected", self.views, place, size=1.1, color=_SELECTED_COLOR)
                 origin = self.views.origins[place]
-                said = f"Selected: {round_title(origin.role, origin.round)}, seed {origin.seed}"
+                said = f"Selected: {round_title(origin.role, origin.round)}, seed {origin.seed}, trust {origin.trust:.2f}"
                 self._message = f'{said}, prompt "{origin.prompt}"' if origin.prompt else said
             self._write_status()
 
@@ -331,4 +355,5 @@ def _label(views: CompletedViews) -> str:
 
 def _told(views: CompletedViews) -> tuple:
     """What a round's drawing depends on."""
-    return tuple(key_of(views, index) for index in range(len(views))), int(views.images.sum(dtype=torch.int64))
+    sums = (int(values.sum(dtype=torch.int64)) for values in (views.images, views.masks, views.pixel_trust))
+    return tuple(key_of(views, index) for index in range(len(views))), *sums

@@ -635,7 +635,8 @@ class Recorder:
 
     def _field(self, label, value=None, **values):
         clicks = []
-        self.fields[label] = SimpleNamespace(value=value, disabled=False, on_click=clicks.append, clicks=clicks, **values)
+        hooks = {"on_click": clicks.append, "on_update": clicks.append, "clicks": clicks}
+        self.fields[label] = SimpleNamespace(value=value, disabled=False, **hooks, **values)
         return self.fields[label]
 
     def add_text(self, label, value, **_):
@@ -662,6 +663,9 @@ class Recorder:
 
     def add_camera_frustum(self, name, **values):
         return self._node(name, **values)
+
+    def add_point_cloud(self, name, points, colors, **values):
+        return self._node(name, points=points, colors=colors, **values)
 
     def add_folder(self, label, order=None):
         return _NoContext()

@@ -43,8 +43,8 @@ class Denoising:
     current: Float[Tensor, "n 32 h w"] | None = None
     """Latents that sampling starts from at a strength below 1."""
     counts: Float[Tensor, "n 32 h w"] | None = None
-    """1 where these count, 0 where sampling starts from noise all the same; None is 1 everywhere. Not looked at when sampling as the
-    original does."""
+    """1 where these count, 0 where sampling starts from noise all the same; None is 1 everywhere. What they tell in part starts in between
+    (`SamplingConfig.joins_at`). Not looked at when sampling as the original does."""
     branches_at_once: int | None = None
     """Branches of guidance in one batch; None is all."""
 
@@ -68,11 +68,16 @@ class Denoising:
     @property
     def times(self) -> list[float]:
         """The times of the sampling: from 1 where anything starts from noise, and then through the strength."""
-        return self.sampling.times_from_noise_too if self._from_noise_too else self.sampling.times
+        return self.sampling.times_from_noise_through(self._shares) if self._from_noise_too else self.sampling.times
 
     @property
     def _from_noise_too(self) -> bool:
-        return self.counts is not None and not bool(self.counts.all())
+        return self.counts is not None and not bool((self.counts == 1).all())
+
+    @property
+    def _shares(self) -> list[float]:
+        """How much the current views tell of latents of which they tell anything, each once."""
+        return [] if self.counts is None else [share for share in self.counts.unique().tolist() if share > 0]
 
     def start(self) -> Float[Tensor, "n 32 h w"]:
         """Where the trajectory starts."""
@@ -114,5 +119,7 @@ class Denoising:
         if sampling.known == "imposed":
             field = imposed(field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning))
         if self.current is not None and self.counts is not None and self._from_noise_too:
-            field = imposed(field, self.current, self.noise, self.counts, until=sampling.strength)
+            for share in self._shares:
+                told = (self.counts == share).to(self.counts)
+                field = imposed(field, self.current, self.noise, told, until=sampling.joins_at(share))
         return field

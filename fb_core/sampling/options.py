@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -100,6 +100,14 @@ class SamplingConfig:
         """The times of a sampling in which some latents start from noise at 1 and all others join them at the strength: from there on
         those of `times`."""
         return self._times(through=(self.strength,))
+
+    def joins_at(self, share: float) -> float:
+        """When a latent joins of which the current views tell so much, 0 to 1: at the strength where wholly, at 1 (noise) where nothing."""
+        return 1.0 - share * (1.0 - self.strength)
+
+    def times_from_noise_through(self, shares: Sequence[float]) -> list[float]:
+        """`times_from_noise_too`, through the times at which latents of these shares join."""
+        return self._times(through=(self.strength, *map(self.joins_at, shares)))
 
     def _times(self, *, start: float = 1.0, through: tuple[float, ...] = ()) -> list[float]:
         if self.reference_compatible:
