@@ -118,18 +118,20 @@ def encode_known(
     generators: Sequence[torch.Generator] | None = None,
     transformer: DiTConfig | None = None,
     guess: tuple[Float[Tensor, "n 3 hp wp"], Float[Tensor, "n 1 hp wp"]] | None = None,
+    precision: torch.dtype = torch.float32,
 ) -> Conditioning:
     """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
 
     With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a ``transformer`` that
     attends in ray frames these are reckoned too. A ``guess`` (images, belief) is told where no pixel is known (:func:`with_guess`).
+    Images are encoded in ``precision`` (:func:`encode_frozen`) unless they are sampled; rays never are, for rounding would move cameras.
     """
     told = only_known(images, image_known)
     if guess is not None:
         told, image_known = with_guess(told, image_known, *guess)
-    image_latents = encode_in_chunks(image_vae, told, views_at_once, generators)
+    image_latents = _encoded_once(image_vae, told, image_known, views_at_once, generators, precision)
     del told
-    ray_latents = encode_in_chunks(raymap_vae, only_known(raymaps01, rays_known), views_at_once, generators)
+    ray_latents = _encoded_once(raymap_vae, only_known(raymaps01, rays_known), rays_known, views_at_once, generators)
     frames = frames_for(transformer, 2 * raymaps01 - 1, rays_known)
     return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known), frames)
 
@@ -152,6 +154,27 @@ def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: 
     masks = like.channels.new_zeros(1, 2, *like.channels.shape[-2:])
     null = torch.cat([image_latent, ray_latent, masks], dim=-3)
     return Conditioning(channels=null.expand(like.channels.shape))
+
+
+def _encoded_once(
+    vae: VAE,
+    told: Float[Tensor, "n c h w"],
+    known: Float[Tensor, "n 1 h w"],
+    views_at_once: int,
+    generators: Sequence[torch.Generator] | None,
+    precision: torch.dtype = torch.float32,
+) -> Float[Tensor, "n 16 lh lw"]:
+    """Latents of what is told; views of which nothing is known, which are all alike, are encoded as one (but for samples, which differ)."""
+    if generators is not None:
+        return encode_in_chunks(vae, told, views_at_once, generators)
+    something = (known > 0).flatten(1).any(dim=1)
+    if int((~something).sum()) < 2:
+        return encode_frozen(vae, told, views_at_once, precision)
+    first = int((~something).nonzero()[0, 0])
+    chosen = torch.cat([something.nonzero()[:, 0], something.new_tensor([first], dtype=torch.long)])
+    latents = encode_frozen(vae, told[chosen], views_at_once, precision)
+    place = torch.where(something, something.cumsum(0) - 1, len(chosen) - 1)
+    return latents[place]
 
 
 def encode_in_chunks(

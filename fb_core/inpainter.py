@@ -20,6 +20,7 @@ from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
 from fb_core.masks import to_latent_grid
 from fb_core.memory import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
+from fb_core.networks.precision import resolved
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
 from fb_core.sampling.options import SamplingConfig
@@ -272,6 +273,7 @@ class Fillerbuster:
             generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
             transformer=self.dit.config,
             guess=None if guess is None else (guess.images, sampling.belief * guess.image_known),
+            precision=resolved(sampling.precision, self.device),
         )
         del canonical
         height, width = conditioning.channels.shape[-2:]

@@ -30,12 +30,13 @@ def main() -> None:
     from fb_core.inpainter import Fillerbuster
 
     model = Fillerbuster.from_pretrained()
-    _say({"steps": model.recommended_sampling.steps})
+    sampling = _replaced(model.recommended_sampling, [], {"precision": "auto"})
+    _say({"steps": sampling.steps})
     training = None
     for line in sys.stdin:
         asked = json.loads(line)
         if "views" in asked:
-            _say(_completed(model, asked))
+            _say(_completed(model, sampling, asked))
         else:
             training = _Training() if training is None else training
             _say(training.step())
@@ -45,7 +46,7 @@ def _say(answer: dict[str, Any]) -> None:
     print(ANSWER + json.dumps(answer), flush=True)
 
 
-def _completed(model: Any, asked: dict[str, Any]) -> dict[str, float]:
+def _completed(model: Any, sampling: Any, asked: dict[str, Any]) -> dict[str, float]:
     """Complete the views of a file, keep the answer in another one."""
     import numpy as np
     import torch
@@ -60,7 +61,7 @@ def _completed(model: Any, asked: dict[str, Any]) -> dict[str, float]:
     views = Views(images=images * image_known, image_known=image_known, raymaps=raymaps, rays_known=known)
     generator = torch.Generator().manual_seed(asked["seed"])
     began, began_cpu = time.perf_counter(), time.process_time()
-    answer = model.complete(views, generator=generator, sampling=model.recommended_sampling)
+    answer = model.complete(views, generator=generator, sampling=sampling)
     took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - began_cpu}
     np.save(asked["answer"], answer.images[asked["known"] :].clamp(0, 1).numpy())
     return took

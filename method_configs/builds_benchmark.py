@@ -28,7 +28,8 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Builds(TableFiles):
-    """Whole samplings by this build and by another checkout of the project, each with its own bundled model and recommended sampling."""
+    """Whole samplings by this build and by another checkout of the project, each with its own bundled model, recommended sampling
+    and the precision that it chooses on this machine."""
 
     other: Path
     """Root of the other checkout (git worktree add ../other COMMIT)."""

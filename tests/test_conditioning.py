@@ -50,6 +50,18 @@ def test_permuting_views_permutes_the_conditioning(vaes):
     assert torch.allclose(encoded(vaes, *(part[order] for part in parts)).channels, straight[order], atol=1e-5)
 
 
+@pytest.mark.parametrize("unknown", [[1], [0, 3], [1, 2, 4], [0, 1, 2, 3, 4]])
+def test_views_of_which_nothing_is_known_are_encoded_as_one_and_told_the_same(vaes, unknown, monkeypatch):
+    images, image_known, rays, rays_known = random_views(5)
+    image_known[unknown], rays_known[unknown[:1]] = 0.0, 0.0
+    each = [encoded(vaes, *(part[view : view + 1] for part in (images, image_known, rays, rays_known))).channels for view in range(5)]
+    encode, counted = VAE.encode, []
+    monkeypatch.setattr(VAE, "encode", lambda self, pixels, *rest: (counted.append(len(pixels)), encode(self, pixels, *rest))[1])
+    together = encoded(vaes, images, image_known, rays, rays_known).channels
+    torch.testing.assert_close(together, torch.cat(each), atol=1e-5, rtol=1e-5)
+    assert sum(counted) == 5 - len(unknown) + 1 + 5
+
+
 def test_null_is_the_conditioning_of_nothing_known(vaes):
     images, _, rays, _ = random_views()
     nothing = torch.zeros(3, 1, 16, 32)
