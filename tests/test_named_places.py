@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 from test_export import generated_views, make_run
 from test_ownership import files, marked, refusal
+from test_whole_files import left_behind
 from tiny_models import save_tiny_model
 
 from fb_core.data.room_captures import rooms
@@ -20,7 +21,8 @@ from fb_core.evaluation.benchmarks import Report
 from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
 from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of, require_own_or_new, signature
 from fb_core.files.whole import whole_folder
-from method_configs import commands, complete_output
+from method_configs import commands, complete_output, demo
+from method_configs.finished_run import read_run
 from method_configs.table_files import csv_text, markdown_text
 
 # ---- single files ---------------------------------------------------------------------------------------------------
@@ -217,3 +219,15 @@ def test_commands_write_two_results_to_one_place_one_after_the_other(tmp_path: P
     monkeypatch.setattr(room_captures, "whole_folder", meanwhile)
     assert "exists already" in refusal(capsys, *command)
     assert [path.name for path in tmp_path.iterdir()] == ["out"] and kind_of(tmp_path / "out") == "capture"
+
+
+def test_what_a_kill_left_confuses_neither_a_demo_nor_whoever_reads_a_run(tiny_capture: Path, tmp_path: Path):
+    """A demo that was killed at its very first file begins anew; half a checkpoint is gone once its run is looked at."""
+    left_behind(tmp_path / "demo" / MARK_NAME)
+    demo._clear(tmp_path / "demo")
+    assert kind_of(tmp_path / "demo") == "demo" and [path.name for path in (tmp_path / "demo").iterdir()] == [MARK_NAME]
+    run = make_run(tmp_path / "run", tiny_capture, None)
+    before = files(run)
+    left_behind(run / "nerfstudio_models", new="half")
+    read_run(run)
+    assert files(run) == before
