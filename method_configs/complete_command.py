@@ -21,6 +21,7 @@ from fb_core.data.own_files import own_points
 from fb_core.data.photo_choice import doubtful, require_two_views
 from fb_core.data.photos import Photo, read_photos
 from fb_core.data.undistort import is_straight
+from fb_core.duration import in_words
 from fb_core.evaluation.self_consistency import self_consistency
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
@@ -30,6 +31,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
 from fb_core.machine import peak_memory_bytes
+from method_configs.complete_forecast import forecast
 from method_configs.complete_options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.complete_output import KIND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
@@ -67,6 +69,7 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     with clock.stage("loading the model"):
         model = _load_model(options, needed=not options.poses_only or (options.cameras != "features" and not job.all_known))
     found, new, told = _work(job, options, model, clock)
+    job = dataclasses.replace(job, photos=found.as_used(job.photos))
     enough = len(found.trusted) >= FEWEST
     report = report_of(source, options, job.photos, job.left_out, model, found, told)
     try:
@@ -195,11 +198,15 @@ def _work(
     views = options.views if path is None else len(path)
     plan = None if model is None or options.poses_only else Plan.of(len(job.photos), views, model, options)
     sampling = None if model is None else pose_sampling(model, options)
-    _logger.info(announcement(job.photos, options, model, plan, sampling))
+    expected = forecast(job.photos, options, model, plan, sampling)
+    _logger.info(announcement(job.photos, options, model, plan, sampling, expected))
     with _bars() as on_progress, clock.stage("cameras"):
         found = find_cameras(job.photos, method=options.cameras, model=model, seed=options.seed, sampling=sampling, on_progress=on_progress)
     for line in what_was_found(job.photos, found):
         _logger.info(line)
+    photos = found.as_used(job.photos)
+    if plan is not None and len(found.trusted) >= FEWEST:
+        _logger.info("The cameras took %.0f s; %s left.", clock.seconds["cameras"], in_words(expected.left(clock.seconds)))
     if plan is None or model is None or len(found.trusted) < FEWEST:
         return found, None, {}
     context = choose_context(found, options.photos)
@@ -209,7 +216,7 @@ def _work(
         plan = Plan.of(len(context), views, model, options)
     with _bars() as on_progress, clock.stage("new views"):
         images = generate(
-            [job.photos[index] for index in context],
+            [photos[index] for index in context],
             [found.camera(index) for index in context],
             path.to(torch.float32),
             plan.passes,
@@ -237,7 +244,7 @@ def _work(
     new = NewViews(images=images, cameras=path, origins=origins)
     if options.check:
         with _bars(), clock.stage("self-consistency"):
-            told["self_consistency"] = _self_consistency(job.photos, found, context, new, model, options)
+            told["self_consistency"] = _self_consistency(photos, found, context, new, model, options)
     return found, new, told
 
 
