@@ -64,10 +64,15 @@ def seconds_of(
     return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
 
 
-def in_words(seconds: float, memory: int) -> str:
-    """What is expected, in round numbers, such as ``about 40 s, up to 0.6 GiB of memory``."""
+def seconds_of_products(products: float, device: str = "cpu") -> float:
+    """Seconds of work that takes as long as so many floating-point operations of large products."""
+    return products / _rate(device, torch.float32)
+
+
+def in_words(seconds: float, memory: int | None = None) -> str:
+    """What is expected, in round numbers, such as ``about 40 s, up to 0.6 GiB of memory``; without the memory where it is not given."""
     takes = f"{max(1, seconds):.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-    return f"about {takes}, up to {max(memory / GIB, 0.1):.1f} GiB of memory"
+    return f"about {takes}" + ("" if memory is None else f", up to {max(memory / GIB, 0.1):.1f} GiB of memory")
 
 
 @lru_cache(maxsize=8)

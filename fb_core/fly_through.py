@@ -41,6 +41,8 @@ class FoundCameras:
     """What found them."""
     tried: dict[str, int]
     """Trusted cameras by each method that was tried."""
+    answers: tuple[tuple[str, Registration], ...] = ()
+    """What each method that was tried says, in order."""
     raymaps: Float[Tensor, "n 6 h w"] | None = None
     """What the model denoised, if it was asked, whoever found the cameras in the end; in its own frame, NaN where nothing was denoised."""
 
@@ -49,6 +51,10 @@ class FoundCameras:
         """Photos that are used."""
         pairs = zip(self.registration.cameras, self.registration.verdicts, strict=True)
         return [index for index, (camera, verdict) in enumerate(pairs) if camera is not None and verdict in TRUSTED]
+
+    def as_used(self, photos: Sequence[Photo]) -> list[Photo]:
+        """The photos, straightened where their lens bends."""
+        return [self.registration.straight.get(index, photo) for index, photo in enumerate(photos)]
 
     def camera(self, index: int) -> Pinholes:
         """Of a trusted photo, whole and at full size."""
@@ -83,7 +89,8 @@ def find_cameras(
     best = max(answers, key=lambda answer: len(answer.trusted))  # the first of equals
     tried = {str(answer.method): len(answer.trusted) for answer in answers}
     raymaps = next((answer.registration.raymaps for answer in answers if answer.method == "model"), None)
-    return FoundCameras(registration=best.registration, method=best.method, tried=tried, raymaps=raymaps)
+    every = tuple((answer.method, answer.registration) for answer in answers)
+    return FoundCameras(registration=best.registration, method=best.method, tried=tried, answers=every, raymaps=raymaps)
 
 
 def choose_context(found: FoundCameras, count: int) -> list[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -45,6 +45,10 @@ class Registration:
     """As the model denoised them, of the photos' central squares, in the model's own frame; None for features."""
     arrangement: Arrangement
     """How the cameras stand to each other."""
+    straight: dict[int, Photo] = field(default_factory=dict)
+    """Photos that were straightened because their lens bends, by number; their cameras are those of the straight photos."""
+    notes: tuple[str, ...] = ()
+    """Sentences for a person on all photos together, such as what was found of their lenses."""
 
 
 def register(
@@ -121,7 +125,7 @@ def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
     )
 
 
-def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Similarity | None) -> Registration:
+def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Similarity | None, straight: dict[int, Photo]) -> Registration:
     known = [photo.camera is not None for photo in photos]
     cameras, verdicts, reasons = list[Pinholes | None](), list[str](), list[str]()
     for photo, camera, trusted, reason in zip(photos, found.cameras, found.trusted, found.reasons, strict=True):
@@ -143,6 +147,8 @@ def _of_features(photos: Sequence[Photo], found: FeatureCameras, to_known: Simil
         residuals_degrees=tuple(found.residuals_degrees),
         raymaps=None,
         arrangement=found.arrangement,
+        straight=straight,
+        notes=tuple(found.notes),
     )
 
 

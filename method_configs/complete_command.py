@@ -21,6 +21,7 @@ from fb_core.data.own_files import own_points
 from fb_core.data.photo_choice import doubtful, require_two_views
 from fb_core.data.photos import Photo, read_photos
 from fb_core.data.undistort import is_straight
+from fb_core.duration import in_words
 from fb_core.evaluation.self_consistency import self_consistency
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
@@ -30,6 +31,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
 from fb_core.machine import peak_memory_bytes
+from method_configs.complete_forecast import forecast
 from method_configs.complete_options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.complete_output import KIND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.complete_report import announcement, no_cameras, report_of, what_was_found
@@ -72,6 +74,7 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
         model = _load_model(options, needed=from_model or (options.cameras != "features" and not job.all_known))
     with _work_of_scene(job, options, output, model) if scene else nullcontext() as work:
         found, new, told = _work(job, options, model, clock, work)
+        job = dataclasses.replace(job, photos=found.as_used(job.photos))
         enough = len(found.trusted) >= FEWEST
         report = report_of(source, options, job.photos, job.left_out, model, found, told)
         try:
@@ -221,8 +224,12 @@ def _work(
     views = options.views if path is None else len(path)
     plan = None if model is None or options.poses_only else Plan.of(len(job.photos), views, model, options)
     sampling = None if model is None else pose_sampling(model, options)
-    _logger.info(announcement(job.photos, options, model, plan, sampling))
+    expected = forecast(job.photos, options, model, plan, sampling)
+    _logger.info(announcement(job.photos, options, model, plan, sampling, expected))
     found = _find_cameras(job, options, model, clock)
+    photos = found.as_used(job.photos)
+    if plan is not None and len(found.trusted) >= FEWEST:
+        _logger.info("The cameras took %.0f s; %s left.", clock.seconds["cameras"], in_words(expected.left(clock.seconds)))
     if plan is None or model is None or len(found.trusted) < FEWEST:
         return found, None, {}
     context = choose_context(found, options.photos)
@@ -232,7 +239,7 @@ def _work(
         plan = Plan.of(len(context), views, model, options)
     with _bars() as on_progress, clock.stage("new views"):
         images = generate(
-            [job.photos[index] for index in context],
+            [photos[index] for index in context],
             [found.camera(index) for index in context],
             path,
             plan.passes,
@@ -260,7 +267,7 @@ def _work(
     new = NewViews(images=images, cameras=path, origins=origins)
     if options.check:
         with _bars(), clock.stage("self-consistency"):
-            told["self_consistency"] = _self_consistency(job.photos, found, context, new, model, options)
+            told["self_consistency"] = _self_consistency(photos, found, context, new, model, options)
     return found, new, told
 
 
@@ -282,16 +289,18 @@ def _work_on_scene(
     from method_configs.scene_work import keep_cameras, kept_cameras
 
     began = time.perf_counter()
-    found = kept_cameras(work)
+    found = kept_cameras(work, job.photos)
     if found is None:
-        _logger.info(announcement(job.photos, options, model, None, None if model is None else pose_sampling(model, options)))
+        sampling = None if model is None else pose_sampling(model, options)
+        expected = forecast(job.photos, options, model, None, sampling)
+        _logger.info(announcement(job.photos, options, model, None, sampling, expected))
         found = _find_cameras(job, options, model, clock)
         keep_cameras(work, found)
     else:
         _logger.info("Going on with what an earlier try has left: %d cameras are there.", len(found.trusted))
     if len(found.trusted) < FEWEST:
         return found, None, {}
-    scene = SceneJob.of(job.photos, found, job.world.points_path, options, work)
+    scene = SceneJob.of(found.as_used(job.photos), found, job.world.points_path, options, work)
     left = 60 * options.minutes - (time.perf_counter() - began)
     with _bars() as on_progress, clock.stage("scene"):
         new, told = complete_with_splats(scene, seconds=left, on_progress=on_progress)

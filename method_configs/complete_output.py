@@ -168,11 +168,12 @@ def _write_capture(folder: Path, photos: list[Photo], found: FoundCameras, new: 
     for place, (index, mask) in enumerate(zip(trusted, masks, strict=True)):
         photo, camera = photos[index], found.camera(index)
         verdict, residual = found.registration.verdicts[index], found.registration.residuals_degrees[index]
+        as_it_is = photo.stored and (photo.camera is None or photo.source in world.straight)
         extra = {"generated": False, "camera": verdict, **({} if math.isnan(residual) else {"residual_degrees": residual})}
         extra |= {} if new is None else {"held_out": place % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1}
         frames.append(
             Frame(
-                image_path=_write_photo(photo, folder / "images", as_it_is=photo.camera is None or photo.source in world.straight),
+                image_path=_write_photo(photo, folder / "images", as_it_is=as_it_is),
                 mask_path=_write_mask(folder, photo.name, mask) if masked else None,
                 camera=camera,
                 camera_model=_MODEL,

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from fb_core.data.photos import Photo
-from fb_core.duration import expected_seconds, in_words
+from fb_core.duration import in_words
 from fb_core.fly_through import FoundCameras
+from fb_core.geometry.pose_verdict import Arrangement
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.memory import GIB, bound
-from method_configs.complete_options import CHECKED, POSES_AT_ONCE, CompleteOptions, Plan
+from fb_core.registration import Registration
+from method_configs.complete_forecast import Forecast
+from method_configs.complete_options import POSES_AT_ONCE, CompleteOptions, Plan
 from method_configs.complete_output import COMMAND
 
 _MOST_NAMED = 5  # photos that are left out, on the screen
@@ -21,36 +24,27 @@ _METHODS = {"known": "given", "model": "by the model", "features": "by features"
 
 
 def announcement(
-    photos: list[Photo], options: CompleteOptions, model: Fillerbuster | None, plan: Plan | None, pose_sampling: SamplingConfig | None
+    photos: list[Photo],
+    options: CompleteOptions,
+    model: Fillerbuster | None,
+    plan: Plan | None,
+    pose_sampling: SamplingConfig | None,
+    forecast: Forecast,
 ) -> str:
     """One sentence on what is about to be done, how long it may take and how much memory it needs."""
     unknown = sum(photo.camera is None for photo in photos)
     posed = "" if unknown == len(photos) else f" ({len(photos) - unknown} with known cameras)"
+    seconds, memory = forecast.total, 0
     if model is None or (plan is None and unknown == 0):
         how = "known" if unknown == 0 else "features"
-        return f"Finding the cameras of {len(photos)} photos{posed} by {how}."
-    seconds, memory = 0.0, 0
+        return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {in_words(seconds)}."
     if unknown and options.cameras != "features":
         assert pose_sampling is not None
-        together = min(len(photos), POSES_AT_ONCE)
-        seconds += (
-            len(photos)
-            / together
-            * expected_seconds(model, views=together, known=together, side=model.size, sampling=pose_sampling, recovers_rays=True)
-        )
-        memory = _memory(model, together, model.size, pose_sampling)
+        memory = _memory(model, min(len(photos), POSES_AT_ONCE), model.size, pose_sampling)
     name = "the bundled model" if options.model is None else f"model {options.model.name}"
     named = f"{name} ({model.model_hash[:8]})"
     if plan is None:
         return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {in_words(seconds, memory)}."
-    for number, chosen in enumerate(plan.passes.views):
-        views = plan.photos + len(chosen) + (plan.passes.anchors if number else 0)
-        seconds += expected_seconds(model, views=views, known=views - len(chosen), side=plan.side, sampling=plan.sampling)
-    if options.check and options.cameras != "features":
-        assert pose_sampling is not None
-        seconds += expected_seconds(
-            model, views=2 * CHECKED, known=2 * CHECKED, side=model.size, sampling=pose_sampling, recovers_rays=True
-        )
     memory = max(memory, _memory(model, plan.longest, plan.side, plan.sampling, options.prompt))
     count = len(plan.passes.views)
     passes = f"{count} {'pass' if count == 1 else 'passes'} of {plan.sampling.steps} steps over up to {plan.longest} views"
@@ -76,6 +70,11 @@ def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
         lines[0] = (
             f"The model is sure of {found.tried['model']} of {len(photos)} cameras, features of {found.tried['features']}. " + lines[0]
         )
+    if registration.arrangement == Arrangement.ONE_PLACE and trusted:
+        lines.append(
+            "All photos were taken in one place: their directions are known, but no distances, so that new views can only turn there."
+        )
+    lines += registration.notes
     others = [index for index in range(len(photos)) if index not in trusted]
     for index in others[:_MOST_NAMED]:
         lines.append(f"left out: {photos[index].name} ({registration.verdicts[index]}: {registration.reasons[index]})")
@@ -86,14 +85,20 @@ def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
 
 def no_cameras(photos: list[Photo], found: FoundCameras, output: Path) -> str:
     """Why there is no capture, and what can be done."""
-    verdicts = Counter(found.registration.verdicts)
-    told = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    told = "; ".join(f"{_METHODS[method]}: {_in_short(registration)}" for method, registration in found.answers)
     other = "features" if "features" not in found.tried else "model" if "model" not in found.tried else None
     advice = f"try --cameras {other}" if other else "add photos that overlap more, or give poses that you have with --known-poses"
     return (
         f"cameras of {len(photos)} photos: expected at least two that can be trusted, got {len(found.trusted)} ({told}); {advice}. "
         f"None was made up; {output} has the report"
     )
+
+
+def _in_short(registration: Registration) -> str:
+    """How often each verdict was given, and the commonest thing that speaks against a camera."""
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(registration.verdicts).most_common())
+    reasons = Counter(reason for reason in registration.reasons if reason).most_common(1)
+    return verdicts + (f", such as: {reasons[0][0]}" if reasons else "")
 
 
 def report_of(
@@ -137,6 +142,7 @@ def report_of(
             "trusted": len(trusted),
             "photos": len(photos) + len(left_out),
             "arrangement": str(registration.arrangement),
+            "notes": list(registration.notes),
         },
         "photos": entries,
         **told,

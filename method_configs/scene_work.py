@@ -19,6 +19,7 @@ from typing import Any
 import torch
 
 from fb_core.data.photos import Photo
+from fb_core.data.straight_photos import straightened
 from fb_core.files.ownership import MARK_NAME, Target, mark_text, real_place, write_mark
 from fb_core.files.whole import discard, whole_file
 from fb_core.fly_through import FoundCameras
@@ -92,6 +93,11 @@ def keep_cameras(folder: Path, found: FoundCameras) -> None:
         "residuals": list(registration.residuals_degrees),
         "own_raymaps": registration.raymaps,
         "arrangement": registration.arrangement.name,
+        "bent": {
+            index: {"camera": dataclasses.asdict(photo.bent[0]), "distortion": photo.bent[1]}
+            for index, photo in registration.straight.items()
+            if photo.bent is not None
+        },
         "method": found.method,
         "tried": dict(found.tried),
         "raymaps": found.raymaps,
@@ -100,8 +106,8 @@ def keep_cameras(folder: Path, found: FoundCameras) -> None:
         torch.save(state, unfinished)
 
 
-def kept_cameras(folder: Path) -> FoundCameras | None:
-    """What :func:`keep_cameras` wrote; None where there is nothing yet."""
+def kept_cameras(folder: Path, photos: Sequence[Photo]) -> FoundCameras | None:
+    """What :func:`keep_cameras` wrote of these photos, those of bent lenses straightened again; None where there is nothing yet."""
     if not (folder / _CAMERAS).is_file():
         return None
     state = torch.load(folder / _CAMERAS, map_location="cpu", weights_only=True)
@@ -113,6 +119,10 @@ def kept_cameras(folder: Path) -> FoundCameras | None:
             residuals_degrees=tuple(state["residuals"]),
             raymaps=state["own_raymaps"],
             arrangement=Arrangement[state["arrangement"]],
+            straight={
+                index: straightened(photos[index], Pinholes(**lens["camera"]), lens["distortion"])[0]
+                for index, lens in state.get("bent", {}).items()
+            },
         ),
         method=state["method"],
         tried=state["tried"],

@@ -16,6 +16,8 @@ from textured_box import cameras_on_an_arc, render
 from tiny_models import save_tiny_model
 
 from fb_core.data.captures import FrameToWrite, validate_capture, write_capture
+from fb_core.data.photos import Photo
+from fb_core.data.straight_photos import straightened
 from fb_core.evaluation.camera_figure import draw_cameras
 from fb_core.evaluation.contact_sheet import write_contact_sheet
 from fb_core.fly_through import FoundCameras
@@ -162,17 +164,25 @@ def test_another_question_begins_anew_and_two_at_once_are_refused(tmp_path: Path
 
 def test_cameras_are_kept_as_they_were_found(tmp_path: Path) -> None:
     camera = cameras_on_an_arc(1).to(torch.float64)
+    pixels = torch.rand(3, camera.height, camera.width), torch.ones(1, camera.height, camera.width)
+    photo = Photo(
+        name="a", source=tmp_path / "a.png", size=(camera.height, camera.width), focal_prior=None, device="", seconds=None, camera=None,
+        thumbnail=pixels[0], pixels=lambda: pixels,
+    )  # fmt: skip
+    straight, camera = straightened(photo, camera, {"k1": -0.1, "k2": 0.01})
     registration = Registration(
         cameras=(camera, None), verdicts=("ok", "no camera"), reasons=("", "too dark"), residuals_degrees=(0.1, math.nan),
-        raymaps=None, arrangement=Arrangement.ONE_CAMERA,
+        raymaps=None, arrangement=Arrangement.ONE_CAMERA, straight={0: straight},
     )  # fmt: skip
     found = FoundCameras(registration=registration, method="features", tried={"features": 1}, raymaps=torch.rand(2, 6, 4, 4))
-    assert scene_work.kept_cameras(tmp_path) is None
+    assert scene_work.kept_cameras(tmp_path, [photo, photo]) is None
     scene_work.keep_cameras(tmp_path, found)
-    kept = scene_work.kept_cameras(tmp_path)
+    kept = scene_work.kept_cameras(tmp_path, [photo, photo])
     assert kept is not None and kept.trusted == [0] and kept.registration.reasons == ("", "too dark") and kept.tried == {"features": 1}
     assert torch.equal(kept.camera(0).camera_to_world, camera.camera_to_world) and math.isnan(kept.registration.residuals_degrees[1])
     assert kept.raymaps is not None and torch.equal(kept.raymaps, found.raymaps) and kept.registration.arrangement == "one camera"
+    again = kept.as_used([photo, photo])
+    assert again[1] is photo and torch.equal(again[0].load(), straight.load()) and not torch.equal(again[0].load(), photo.load())
 
 
 @pytest.mark.parametrize("kind", ["two photos", "three photos", "a pure rotation"])

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from fb_core.evaluation.pose_metrics import pose_errors
-from fb_core.geometry.bundle_adjustment import Bundle, _jacobians, adjust
+from fb_core.geometry.bundle_adjustment import Bundle, Lenses, _jacobians, adjust
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.feature_chain import chain
 from fb_core.geometry.feature_pairs import PhotoFeatures, features_of, match_pairs, verified_pair
@@ -233,6 +233,7 @@ def bundle(*, cameras: int = 4, points: int = 30, seed: int = 0) -> Bundle:
         rotations=world_to_camera[:, :3, :3],
         shifts=world_to_camera[:, :3, 3],
         focal=np.array([500.0, 500.0]),
+        bend=np.zeros((2, 2)),
         lens=np.arange(cameras) % 2,
         points=places.numpy(),
         camera_of=camera_of,
@@ -242,7 +243,11 @@ def bundle(*, cameras: int = 4, points: int = 30, seed: int = 0) -> Bundle:
     )
 
 
-UNTOLD = {"told": np.full(2, np.nan), "deviation": np.ones(2)}
+def lenses(*, told: float = math.nan, deviation: float = 1.0, bends: int = 0) -> Lenses:
+    """Of the bundle's two lenses."""
+    free = np.ones(2, bool)
+    bend_free = np.tile(np.arange(2) < bends, (2, 1))
+    return Lenses(told=np.full(2, told), deviation=np.full(2, deviation), focal_free=free, bend_free=bend_free)
 
 
 def perturbed(exact: Bundle, amount: float) -> Bundle:
@@ -257,18 +262,19 @@ def perturbed(exact: Bundle, amount: float) -> Bundle:
 
 
 def test_the_adjustment_finds_exact_observations_again():
-    found = adjust(perturbed(bundle(), 0.02), steps=40, **UNTOLD)
+    found = adjust(perturbed(bundle(), 0.02), lenses(), steps=40)
     assert np.abs(found.misses()).max() < 1e-4 and found.focal == pytest.approx([500.0, 500.0], rel=0.05)
 
 
 def test_told_focal_lengths_stay():
-    told = {"told": np.full(2, 480.0), "deviation": np.full(2, 1e-6)}
     start = dataclasses.replace(perturbed(bundle(), 0.01), focal=np.full(2, 480.0))
-    assert adjust(start, steps=10, **told).focal == pytest.approx([480.0, 480.0], rel=1e-3)
+    assert adjust(start, lenses(told=480.0, deviation=1e-6), steps=10).focal == pytest.approx([480.0, 480.0], rel=1e-3)
 
 
 def test_derivatives_are_those_of_differences():
-    here = perturbed(bundle(cameras=2, points=5), 1e-5)  # misses far below the tolerance, where weights are constant
+    straight = dataclasses.replace(bundle(cameras=2, points=5), bend=np.array([[-0.12, 0.03], [0.05, -0.01]]))
+    here = dataclasses.replace(straight, offsets=straight.offsets + straight.misses())
+    here = perturbed(here, 1e-5)  # misses far below the tolerance, where weights are constant
     of_camera, of_point, _ = _jacobians(here)
     step = 1e-6
 
@@ -283,11 +289,13 @@ def test_derivatives_are_those_of_differences():
         assert moved(shifts=here.shifts + vector) == pytest.approx(of_camera[:, :, 3 + axis], rel=1e-3, abs=1e-2)
         assert moved(points=here.points + vector) == pytest.approx(of_point[:, :, axis], rel=1e-3, abs=1e-2)
     assert moved(focal=here.focal * np.exp(step)) == pytest.approx(of_camera[:, :, 6], rel=1e-3, abs=1e-2)
+    for coefficient in range(2):
+        assert moved(bend=here.bend + step * np.eye(2)[coefficient]) == pytest.approx(of_camera[:, :, 7 + coefficient], rel=1e-3, abs=1e-2)
 
 
 def test_points_behind_a_camera_do_no_harm():
     exact = bundle()
     points = exact.points.copy()
     points[0] = [100.0, 0.0, 0.0]  # behind the first camera
-    found = adjust(dataclasses.replace(exact, points=points), steps=10, **UNTOLD)
+    found = adjust(dataclasses.replace(exact, points=points), lenses(), steps=10)
     assert np.isfinite(found.points).all() and np.abs(found.misses()).reshape(4, -1, 2)[:, 1:].max() < 1.0

@@ -22,6 +22,7 @@ from fb_core.data.capture_layouts import layout_of
 from fb_core.data.captures import Frame, read_capture
 from fb_core.data.exif import read_exif
 from fb_core.data.own_files import lies_inside
+from fb_core.data.panoramas import around_fault, goes_on_at_its_edge, panorama_fault
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import resampled
 
@@ -56,6 +57,10 @@ class Photo:
     """The picture with at most ``THUMBNAIL_SIDE`` pixels per side."""
     pixels: Callable[[], Pixels] = field(repr=False, compare=False)
     """Decodes colours in [0, 1] and the known-mask at full size."""
+    stored: bool = True
+    """Whether the file holds this very picture; one that was straightened later is nowhere stored."""
+    bent: tuple[Pinholes, dict[str, float]] | None = field(default=None, repr=False, compare=False)
+    """What a photo was straightened from after its lens was found: camera of the bent picture, distortion."""
 
     def load(self, longest_side: int | None = None) -> Float[Tensor, "3 h w"]:
         """The picture, RGB in [0, 1], shrunk by area averages so that no side is longer than ``longest_side`` pixels."""
@@ -139,6 +144,8 @@ def _still(path: Path, name: str) -> Photo:
         return _still_pixels(path)
 
     image, mask = pixels()
+    if fault := panorama_fault(path, image):
+        raise ValueError(f"image {path}: {fault}")
     size = (image.shape[1], image.shape[2])
     exif = read_exif(path, size)
     return Photo(
@@ -202,7 +209,7 @@ def _of_film(path: Path, most: int) -> list[Photo]:
     if path.suffix.lower() in PHOTO_SUFFIXES:
         raise ValueError(f"photos {path}: expected a folder of at least 2 photos, or a film, got one photo; give its folder: {path.parent}")
     film = video.read_film(path, most)
-    return [
+    photos = [
         Photo(
             name=f"frame_{frame.number:05d}",
             source=path,
@@ -216,6 +223,9 @@ def _of_film(path: Path, most: int) -> list[Photo]:
         )
         for frame in film.frames
     ]
+    if sum(goes_on_at_its_edge(photo.thumbnail) for photo in photos) > len(photos) / 2:
+        raise ValueError(f"film {path}: {around_fault(film.size, kind='video')}")
+    return photos
 
 
 def _all_known(image: Float[Tensor, "3 h w"]) -> Pixels:

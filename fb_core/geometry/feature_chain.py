@@ -6,49 +6,43 @@ give new points, and so on; a bundle adjustment mends all cameras, focal lengths
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from fb_core.geometry.bundle_adjustment import Bundle, adjust
+from fb_core.geometry.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.feature_pairs import Pair, PhotoFeatures, match_pairs, verified_pair
-from fb_core.geometry.feature_panorama import Panorama, panorama_of
+from fb_core.geometry.feature_cameras import FeatureCameras, camera_of, one_place
+from fb_core.geometry.feature_lenses import FOCAL_GUESS, SAME_LENS, LensGuess
+from fb_core.geometry.feature_pairs import Pair, PhotoFeatures, match_pairs, rays_of, verified_pair
+from fb_core.geometry.feature_panorama import panorama_of
+from fb_core.geometry.feature_trust import agreeing_shares, deviations_of, doubt, epipolar_misses
 from fb_core.geometry.pose_verdict import Arrangement
 from fb_core.geometry.triangulation import nearest_points, tracks_of
 
-FOCAL_GUESS = 1.2
-"""Focal length in longer sides where nothing tells more: a normal lens (43 mm on film), the customary start."""
 _GUESSES = (FOCAL_GUESS, 0.7)  # the second is a phone's (26 mm on film)
-_FOCAL_TOLD, _FOCAL_GUESSED = 0.02, 0.5  # deviations of the logarithm
 _PANORAMA = 0.8  # share of all matches that rotations alone explain, from which nothing else is looked for
-_COPIES_DEGREES = 0.2  # photos in one place that are turned by less are copies of one another
 _STARTS = 3  # pairs that may begin
 _GOOD_ANGLE_DEGREES = 8.0  # of a starting pair; wider ones are no better
 _LEAST_ANGLE_DEGREES = 1.5  # between the rays of a point
 _FEWEST_POINTS = 12  # that place a photo
 _TRUSTED_POINTS = 24  # of a photo that is beyond doubt
 _OUTLIER = 3.0  # tolerances
+_LIE = 0.1  # logarithm of the focal length found over the one told, from which the tag is not believed
+_MOST_ROUNDS = 4  # of freeing lenses
+_SHARP, _SHARPEST = 4.5, 0.3  # medians from which a match does not count as explained, but no less than so many tolerances
+_SAME_GAIN = 0.005  # share of matches that makes no difference
+_FOCAL_FACTORS = (1.0, 0.5, 0.7, 1.4, 2.0)  # of what is believed, for the first photo of a lens of which nothing was told
 
 
-@dataclass(frozen=True, kw_only=True)
-class FeatureCameras:
-    """What features say of n photos."""
-
-    cameras: list[Pinholes | None]
-    """Each a batch of one, float64, of the whole photo, in a world of their own; None where features do not tell."""
-    trusted: list[bool]
-    """Whether there is a camera beyond doubt."""
-    reasons: list[str]
-    """What is to be doubted, or worth knowing; empty where all is well."""
-    residuals_degrees: list[float]
-    """Root mean square of the angles by which features miss their points, per axis; NaN where there is no camera."""
-    arrangement: Arrangement
-    """How the cameras stand to each other."""
+Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
+"""Features of two photos each that belong together."""
 
 
 def chain(photos: Sequence[PhotoFeatures], *, on_progress: Callable[[str, int, int], None] = lambda *_: None) -> FeatureCameras:
@@ -59,29 +53,66 @@ def chain(photos: Sequence[PhotoFeatures], *, on_progress: Callable[[str, int, i
     matches = match_pairs(photos, lambda done, total: on_progress("matching features", done, total))
     panorama = panorama_of(photos, matches, guess=FOCAL_GUESS)
     if panorama.share >= _PANORAMA or not matches:
-        return _one_place(photos, panorama)
+        return one_place(photos, panorama, sure=panorama.share >= _PANORAMA)
     untold = any(photo.focal is None for photo in photos)
     best: _Chain | None = None
     for guess in _GUESSES if untold else _GUESSES[:1]:
-        focal = [photo.focal or guess * max(photo.size) for photo in photos]
-        best = _better(best, _reconstructed(photos, matches, focal, on_progress))
+        best = _better(best, _reconstructed(photos, matches, LensGuess.of(photos, guess=guess), on_progress))
     if untold and best is not None:
-        best = _better(best, _reconstructed(photos, matches, best.focal[best.lens].tolist(), on_progress))
-    return best.concluded() if best is not None else _one_place(photos, panorama)
+        best = _better(best, _reconstructed(photos, matches, best.lenses, on_progress))
+    if best is None:
+        return one_place(photos, panorama, sure=panorama.share >= _PANORAMA)
+    return _with_fitting_lenses(best, matches, on_progress).concluded(matches)
+
+
+def _with_fitting_lenses(best: _Chain, matches: Matches, on_progress: Callable[[str, int, int], None]) -> _Chain:
+    """The reconstruction with the lenses that the matches ask for: as few numbers as explain them.
+
+    Each round frees one thing more (tags that lie, k1, k2, a focal length for each photo), adjusts, and keeps what explains clearly more
+    matches; with new lenses everything is built once more, since pairs were judged by the old ones.
+    """
+    photos = best.photos
+    for _ in range(_MOST_ROUNDS if best.registered.sum() > 2 else 0):
+        options = [best.with_lenses(lenses) for lenses in best.lenses.freer(best.bad_tags)]
+        gains = [_gain(best, option, matches) for option in options]
+        chosen = [index for index, option in enumerate(options) if gains[index] > option.lenses.least_gain(best.lenses)]
+        if not chosen:
+            break
+        fitted = options[max(chosen, key=lambda index: gains[index])]
+        anew = _reconstructed(photos, matches, fitted.lenses, on_progress)
+        best = fitted if anew is None or _gain(fitted, anew, matches) < 0 else anew
+    for within in SAME_LENS:
+        lenses = best.lenses.merged(within)
+        if 1 < len(lenses.focal) < len(best.lenses.focal):  # with one, everything began
+            merged = best.with_lenses(lenses)
+            if _gain(best, merged, matches) > -_SAME_GAIN:
+                return merged
+    return best
+
+
+def _gain(first: _Chain, second: _Chain, matches: Matches) -> float:
+    """By which share of all matches the second explains more than the first, to the precision of the better one."""
+    misses = [grown.pair_misses(matches) for grown in (first, second)]
+    total = sum(map(len, matches.values()))
+    limit = min(float(np.median(np.concatenate(list(one.values())))) if one else _OUTLIER for one in misses)
+    limit = min(max(_SHARP * limit, _SHARPEST), 2.0)
+    explained = [sum(np.maximum(1 - (miss / limit) ** 2, 0.0).sum() for miss in one.values()) / total for one in misses]
+    return float(explained[1] - explained[0])
 
 
 def _reconstructed(
     photos: Sequence[PhotoFeatures],
-    matches: dict[tuple[int, int], Int[np.ndarray, "m 2"]],
-    focal: Sequence[float],
+    matches: Matches,
+    lenses: LensGuess,
     on_progress: Callable[[str, int, int], None],
 ) -> _Chain | None:
     """The best of a few beginnings; None if no two photos make one."""
-    pairs = [pair for key, value in matches.items() if (pair := verified_pair(photos, key, value, focal)) is not None]
+    focal, bend = lenses.focal[lenses.lens].tolist(), lenses.bend[lenses.lens]
+    pairs = [pair for key, value in matches.items() if (pair := verified_pair(photos, key, value, focal, bend)) is not None]
     best: _Chain | None = None
     apart = [pair for pair in pairs if pair.parallax_degrees >= _LEAST_ANGLE_DEGREES]
     for start in sorted(apart, key=_worth, reverse=True)[:_STARTS]:
-        grown = _Chain.begun(photos, pairs, focal, start)
+        grown = _Chain.begun(photos, pairs, lenses, start)
         grown.grow(lambda done: on_progress("placing photos", done, len(photos)))
         best = _better(best, grown)
         if grown.registered.all():
@@ -102,8 +133,9 @@ def _better(first: _Chain | None, second: _Chain | None) -> _Chain | None:
 class _Chain:
     """A reconstruction that grows."""
 
-    def __init__(self, photos: Sequence[PhotoFeatures], pairs: Sequence[Pair], focal: Sequence[float]):
+    def __init__(self, photos: Sequence[PhotoFeatures], pairs: Sequence[Pair], lenses: LensGuess):
         self.photos = photos
+        self.lenses = dataclasses.replace(lenses, focal=lenses.focal.copy(), bend=lenses.bend.copy())  # they change
         starts = np.cumsum([0, *(len(photo.places) for photo in photos)])
         links = [pair.matches + np.array([starts[pair.first], starts[pair.second]]) for pair in pairs]
         track = tracks_of(torch.from_numpy(np.concatenate(links)), int(starts[-1])).numpy()
@@ -114,20 +146,15 @@ class _Chain:
         self.offsets: Float[np.ndarray, "o 2"] = np.concatenate([photo.offsets for photo in photos])[kept]
         self.tolerance: Float[np.ndarray, " o"] = np.array([photo.tolerance for photo in photos])[self.owner]
         self.good: Bool[np.ndarray, " o"] = np.ones(len(self.owner), bool)
-        lenses = list(dict.fromkeys(photo.lens for photo in photos))
-        self.lens: Int[np.ndarray, " n"] = np.array([lenses.index(photo.lens) for photo in photos])
-        self.focal: Float[np.ndarray, " l"] = np.array([focal[int(np.argmax(self.lens == number))] for number in range(len(lenses))])
-        told = np.array([photos[int(np.argmax(self.lens == number))].focal is not None for number in range(len(lenses))])
-        self.told, self.deviation = self.focal.copy(), np.where(told, _FOCAL_TOLD, _FOCAL_GUESSED)
         self.rotations = np.tile(np.eye(3), (len(photos), 1, 1))
         self.shifts = np.zeros((len(photos), 3))
         self.registered: Bool[np.ndarray, " n"] = np.zeros(len(photos), bool)
         self.points = np.full((int(track.max()) + 1, 3), np.nan)
 
     @staticmethod
-    def begun(photos: Sequence[PhotoFeatures], pairs: Sequence[Pair], focal: Sequence[float], start: Pair) -> _Chain:
+    def begun(photos: Sequence[PhotoFeatures], pairs: Sequence[Pair], lenses: LensGuess, start: Pair) -> _Chain:
         """With two cameras, one unit apart."""
-        grown = _Chain(photos, pairs, focal)
+        grown = _Chain(photos, pairs, lenses)
         grown.registered[[start.first, start.second]] = True
         grown.rotations[start.second], grown.shifts[start.second] = start.rotation, start.translation
         grown.triangulate()
@@ -174,29 +201,42 @@ class _Chain:
         import cv2
 
         mine = np.flatnonzero((self.owner == index) & np.isfinite(self.points[self.track, 0]))
-        focal, tolerance = self.focal[self.lens[index]], self.photos[index].tolerance
-        points, places = self.points[self.track[mine]], self.offsets[mine] / focal
-        options: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 3 * tolerance / focal, "confidence": 0.9999}
-        done, turn, shift, inliers = cv2.solvePnPRansac(points, places, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_SQPNP, **options)
-        if not done or inliers is None or len(inliers) < max(_FEWEST_POINTS, 0.3 * len(mine)):
+        number, tolerance = self.lenses.lens[index], self.photos[index].tolerance
+        unseen = not self.lenses.believed[number] and not (self.registered & (self.lenses.lens == number)).any()
+        best: tuple[np.ndarray, np.ndarray, np.ndarray, float] | None = None
+        for factor in _FOCAL_FACTORS if unseen else _FOCAL_FACTORS[:1]:
+            focal = self.lenses.focal[number] * factor
+            places = straightened(self.offsets[mine] / focal, self.lenses.bend[number])
+            there = np.flatnonzero(np.isfinite(places[:, 0]))
+            if len(there) < _FEWEST_POINTS:
+                continue
+            points, places = self.points[self.track[mine[there]]], places[there]
+            options: dict[str, Any] = {"iterationsCount": 1000, "reprojectionError": 3 * tolerance / focal, "confidence": 0.9999}
+            done, turn, shift, inliers = cv2.solvePnPRansac(points, places, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_SQPNP, **options)
+            if not done or inliers is None or (best is not None and len(inliers) <= len(best[2])):
+                continue
+            inliers = inliers[:, 0].astype(np.int64)
+            turn, shift = cv2.solvePnPRefineLM(points[inliers], places[inliers], np.eye(3), np.zeros(4), turn, shift)
+            best = cv2.Rodrigues(turn)[0], shift[:, 0], mine[there[inliers]], focal
+        if best is None or len(best[2]) < max(_FEWEST_POINTS, 0.3 * len(mine)):
             return False
-        inliers = inliers[:, 0].astype(np.int64)
-        turn, shift = cv2.solvePnPRefineLM(points[inliers], places[inliers], np.eye(3), np.zeros(4), turn, shift)
-        self.rotations[index], self.shifts[index] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        self.rotations[index], self.shifts[index], agreeing, self.lenses.focal[number] = best
         self.registered[index] = True
         self.good[mine] = False
-        self.good[mine[inliers]] = True
+        self.good[agreeing] = True
         return True
 
     def triangulate(self) -> None:
         """Points of all tracks that have none and that two placed photos see well."""
         mine = np.flatnonzero(self.good & self.registered[self.owner] & ~np.isfinite(self.points[self.track, 0]))
+        plane = self.lenses.plane(self.owner[mine], self.offsets[mine])
+        pictured = np.isfinite(plane[:, 0])
+        mine, plane = mine[pictured], plane[pictured]
         if len(mine) == 0:
             return
         tracks, compact = np.unique(self.track[mine], return_inverse=True)
         rotations = self.rotations[self.owner[mine]]
-        rays = np.concatenate([self.offsets[mine] / self._focal_of(mine)[:, None], np.ones((len(mine), 1))], axis=1)
-        directions = np.einsum("oji,oj->oi", rotations, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        directions = np.einsum("oji,oj->oi", rotations, rays_of(plane))
         centers = -np.einsum("oji,oj->oi", rotations, self.shifts[self.owner[mine]])
         error = float(np.degrees(np.median(2 * self.tolerance[mine] / self._focal_of(mine))))
         points, sound = nearest_points(
@@ -214,49 +254,92 @@ class _Chain:
         """Bundle adjustment of what is placed, after which outliers are left out and what was one may come back."""
         used = np.flatnonzero(self.used)
         bundle, cameras, lenses, tracks = self._bundle(used)
-        focal_free = self.registered.sum() > 2  # two views hardly tell it
-        deviation = self.deviation[lenses] if focal_free else np.full(len(lenses), 1e-4)
-        told = self.told[lenses] if focal_free else self.focal[lenses]
-        bundle = adjust(bundle, told=told, deviation=deviation, steps=steps)
+        focal_free = bool(self.registered.sum() > 2)  # two views hardly tell it
+        bundle = adjust(bundle, self.lenses.known(lenses, focal_free=focal_free), steps=steps)
         self.rotations[cameras], self.shifts[cameras] = bundle.rotations, bundle.shifts
-        self.focal[lenses], self.points[tracks] = bundle.focal, bundle.points
+        self.lenses.focal[lenses], self.lenses.bend[lenses], self.points[tracks] = bundle.focal, bundle.bend, bundle.points
         seen = np.flatnonzero(self.registered[self.owner] & np.isfinite(self.points[self.track, 0]))
         misses = np.linalg.norm(self._bundle(seen)[0].misses(), axis=1)
         self.good[seen] = misses <= _OUTLIER * self.tolerance[seen]
         self._forget_weak_points()
 
-    def concluded(self) -> FeatureCameras:
+    def with_lenses(self, lenses: LensGuess) -> _Chain:
+        """This reconstruction, adjusted to other lenses."""
+        other = copy.copy(self)
+        other.lenses = dataclasses.replace(lenses, focal=lenses.focal.copy(), bend=lenses.bend.copy())
+        for name in ("good", "rotations", "shifts", "registered", "points"):
+            setattr(other, name, getattr(self, name).copy())
+        for _ in range(3):
+            other.adjust(steps=10)
+            other.triangulate()
+        if not other.registered.all():
+            other.grow(lambda _: None)  # with a lens of their own they may have a place
+        else:
+            other.adjust(steps=15)
+        return other
+
+    @property
+    def bad_tags(self) -> Bool[np.ndarray, " l"]:
+        """Lenses whose focal length is found far from what is told."""
+        return self.lenses.believed & ~self.lenses.fixed & (np.abs(np.log(self.lenses.focal / self.lenses.told)) > _LIE)
+
+    def pair_misses(self, matches: Matches) -> dict[tuple[int, int], Float[np.ndarray, " _"]]:
+        """By how many tolerances matches of placed photos miss their epipolar lines."""
+        found = {}
+        for (i, j), both in matches.items():
+            if self.registered[i] and self.registered[j]:
+                first = self.lenses.plane(np.full(len(both), i), self.photos[i].offsets[both[:, 0]])
+                second = self.lenses.plane(np.full(len(both), j), self.photos[j].offsets[both[:, 1]])
+                rotation = self.rotations[j] @ self.rotations[i].T
+                way = self.shifts[j] - rotation @ self.shifts[i]
+                scale = [self.lenses.focal[self.lenses.lens[index]] / self.photos[index].tolerance for index in (i, j)]
+                found[i, j] = epipolar_misses(first, second, rotation, way) * math.sqrt(scale[0] * scale[1])
+        return found
+
+    def concluded(self, matches: Matches) -> FeatureCameras:
         """Cameras, and what is to be doubted of each."""
         used = np.flatnonzero(self.used)
-        misses = self._bundle(used)[0].misses()
+        bundle, cameras_of, lenses, _ = self._bundle(used)
+        misses, counts = bundle.misses(), np.bincount(self.owner[used], minlength=len(self.photos))
+        found = deviations_of(bundle, self.lenses.known(lenses))
+        agreeing = agreeing_shares(self.pair_misses(matches), len(self.photos))
         cameras, reasons, residuals = list[Pinholes | None](), list[str](), list[float]()
         for index, photo in enumerate(self.photos):
-            own = misses[self.owner[used] == index]
-            focal = self.focal[self.lens[index]]
-            if not self.registered[index] or len(own) < _FEWEST_POINTS:
+            if not self.registered[index] or counts[index] < _FEWEST_POINTS:
                 cameras.append(None)
                 residuals.append(float("nan"))
-                reasons.append(f"shares too few features with the others ({len(own)} points, a camera needs {_FEWEST_POINTS})")
+                reasons.append(f"shares too few features with the others ({counts[index]} points, a camera needs {_FEWEST_POINTS})")
                 continue
-            cameras.append(_camera(photo, self.rotations[index], self.shifts[index], focal))
+            own = misses[self.owner[used] == index]
+            focal = self.lenses.focal[self.lenses.lens[index]]
+            cameras.append(camera_of(photo, self.rotations[index], self.shifts[index], focal))
             residuals.append(float(np.degrees(np.sqrt(np.square(own).mean()) / focal)))
-            few = len(own) < _TRUSTED_POINTS
-            reasons.append(f"only {len(own)} points are seen in it and in others, expected {_TRUSTED_POINTS}" if few else "")
-        trusted = [not reason for reason in reasons]
-        return FeatureCameras(cameras=cameras, trusted=trusted, reasons=reasons, residuals_degrees=residuals, arrangement=Arrangement.APART)
+            few = counts[index] < _TRUSTED_POINTS
+            reason = f"only {counts[index]} points are seen in it and in others, expected {_TRUSTED_POINTS}" if few else ""
+            reasons.append(reason or doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
+        return FeatureCameras(
+            cameras=cameras,
+            trusted=[not reason for reason in reasons],
+            reasons=reasons,
+            residuals_degrees=residuals,
+            arrangement=Arrangement.APART,
+            bends=[(float(k1), float(k2)) for k1, k2 in self.lenses.bend[self.lenses.lens]],
+            notes=self.lenses.notes([max(photo.size) for photo in self.photos]),
+        )
 
     def _focal_of(self, observations: Int[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        return self.focal[self.lens[self.owner[observations]]]
+        return self.lenses.focal[self.lenses.lens[self.owner[observations]]]
 
     def _bundle(self, observations: Int[np.ndarray, " k"]) -> tuple[Bundle, np.ndarray, np.ndarray, np.ndarray]:
         """What some observations are of, and which cameras, lenses and tracks it holds."""
         cameras, camera_of = np.unique(self.owner[observations], return_inverse=True)
         tracks, point_of = np.unique(self.track[observations], return_inverse=True)
-        lenses, lens = np.unique(self.lens[cameras], return_inverse=True)
+        lenses, lens = np.unique(self.lenses.lens[cameras], return_inverse=True)
         bundle = Bundle(
             rotations=self.rotations[cameras],
             shifts=self.shifts[cameras],
-            focal=self.focal[lenses],
+            focal=self.lenses.focal[lenses],
+            bend=self.lenses.bend[lenses],
             lens=lens,
             points=self.points[tracks],
             camera_of=camera_of,
@@ -271,36 +354,6 @@ class _Chain:
         weak = np.bincount(self.track[self.used], minlength=len(self.points)) < 2
         self.points[weak] = np.nan
         self.good[weak[self.track]] = True
-
-
-def _one_place(photos: Sequence[PhotoFeatures], panorama: Panorama) -> FeatureCameras:
-    """Rotations are all that features tell."""
-    cameras = [
-        None if turn is None else _camera(photo, turn, np.zeros(3), focal)
-        for photo, turn, focal in zip(photos, panorama.rotations, panorama.focal, strict=True)
-    ]
-    turns = [turn for turn in panorama.rotations if turn is not None]
-    copies = all(np.trace(turn @ turns[0].T) > 1 + 2 * np.cos(np.radians(_COPIES_DEGREES)) for turn in turns)
-    here = "shows the same as the others, from the same place" if copies else "taken in the same place as the others: no distances"
-    return FeatureCameras(
-        cameras=cameras,
-        trusted=[camera is not None and not copies for camera in cameras],
-        reasons=["shares too few features with the others" if camera is None else here for camera in cameras],
-        residuals_degrees=[float("nan")] * len(photos),
-        arrangement=Arrangement.ONE_PLACE if turns else Arrangement.NO_CAMERA,
-    )
-
-
-def _camera(photo: PhotoFeatures, rotation: np.ndarray, shift: np.ndarray, focal: float) -> Pinholes:
-    height, width = photo.size
-    pose = torch.from_numpy(np.concatenate([rotation.T, -(rotation.T @ shift)[:, None]], axis=1))
-    return Pinholes(
-        camera_to_world=pose[None],
-        focal=torch.full((1, 2), float(focal), dtype=torch.float64),
-        principal=torch.tensor([[width / 2, height / 2]], dtype=torch.float64),
-        width=width,
-        height=height,
-    )
 
 
 def _twice(owner: np.ndarray, track: np.ndarray) -> np.ndarray:

@@ -10,11 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fb_core.geometry.bundle_adjustment import straightened
 from fb_core.geometry.triangulation import detect, mutual_matches
 from fb_core.masks import resampled
 
 _COARSE_SIDE, _COARSE_LIMIT = 320, 400  # small copies of photos that tell which of them are worth matching
-_FEATURES = 2500
+FEATURES = 2500
+"""Of one photo at most."""
 _ALL_PAIRS = 16  # photos of which every pair is matched
 _PARTNERS = 12  # of each photo when there are more
 _RATIO = 0.8  # Lowe 2004
@@ -39,7 +41,9 @@ class PhotoFeatures:
     focal: float | None
     """In pixels, where it is known."""
     lens: str
-    """Photos with the same text share one focal length (in pixels of this size)."""
+    """Photos with the same text share one focal length (in pixels of this size), unless they say otherwise."""
+    known: bool = False
+    """Whether the focal length stands and the lens is straight: the photo's camera is known."""
 
     @property
     def offsets(self) -> Float[np.ndarray, "k 2"]:
@@ -53,11 +57,11 @@ class PhotoFeatures:
 
 
 def features_of(
-    image: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"] | None = None, *, focal: float | None, lens: str
+    image: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"] | None = None, *, focal: float | None, lens: str, posed: bool = False
 ) -> PhotoFeatures:
-    """Features of a photo, RGB in [0, 1]; `known` is 1 where it may be used."""
+    """Features of a photo, RGB in [0, 1]; `known` is 1 where it may be used. The camera of a `posed` photo is known."""
     size = (image.shape[1], image.shape[2])
-    places, descriptors, _ = detect(image, known, limit=_FEATURES)
+    places, descriptors, _ = detect(image, known, limit=FEATURES)
     shrink = min(1.0, _COARSE_SIDE / max(size))
     small = [max(1, round(side * shrink)) for side in size]
     everything = torch.ones_like(image[:1])
@@ -67,7 +71,7 @@ def features_of(
 
     small_image, share = resampled(image, everything if known is None else known, shrunk)
     coarse = detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
-    return PhotoFeatures(places=places, descriptors=descriptors, coarse=coarse, size=size, focal=focal, lens=lens)
+    return PhotoFeatures(places=places, descriptors=descriptors, coarse=coarse, size=size, focal=focal, lens=lens, known=posed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +88,11 @@ class Pair:
     """Unit vector: where the first camera's centre is in the second's axes."""
     parallax_degrees: float
     """Median angle between the matches' rays once the rotation is taken out."""
+
+
+def pairs_at_most(count: int) -> int:
+    """How many pairs of so many photos are matched at most."""
+    return count * (min(count, _ALL_PAIRS) - 1) // 2 if count <= _ALL_PAIRS else count * _PARTNERS
 
 
 def candidate_pairs(photos: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
@@ -126,12 +135,22 @@ def match_pairs(photos: Sequence[PhotoFeatures], on_pair: Callable[[int, int], N
 
 
 def verified_pair(
-    photos: Sequence[PhotoFeatures], key: tuple[int, int], matches: Int[np.ndarray, "m 2"], focal: Sequence[float]
+    photos: Sequence[PhotoFeatures],
+    key: tuple[int, int],
+    matches: Int[np.ndarray, "m 2"],
+    focal: Sequence[float],
+    bend: Float[np.ndarray, "n 2"] | None = None,
 ) -> Pair | None:
-    """The motion between two photos of known focal lengths, with the matches that agree with it; None if too few do."""
+    """The motion between two photos of known lenses (k1 and k2 in `bend`), with the matches that agree with it; None if too few do."""
     i, j = key
     first = photos[i].offsets[matches[:, 0]] / focal[i]
     second = photos[j].offsets[matches[:, 1]] / focal[j]
+    if bend is not None and bend.any():
+        first, second = straightened(first, bend[i]), straightened(second, bend[j])
+        pictured = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
+        matches, first, second = matches[pictured], first[pictured], second[pictured]
+        if len(matches) < FEWEST_MATCHES:
+            return None
     tolerance = max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j])
     rotation, translation, inliers = _motion(first, second, tolerance)
     if inliers.sum() < FEWEST_MATCHES:
