@@ -1,7 +1,7 @@
 """Screenshot of nerfstudio's viewer with the generated frustums of a finished run, by a headless Chromium.
 
-    python docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml
-    python docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml --complete 3 \\
+    python docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml python
+    docs/make_viewer_screenshot.py --load-config outputs/demo/runs/room/fillerbuster/run/config.yml --complete 3 \\
         --output docs/images/viewer_complete.png
 
 The second line lets the run train on, presses "Complete from here" as a person would, and shows what came of it.
@@ -25,7 +25,7 @@ from pathlib import Path
 import tyro
 from playwright.sync_api import Page, sync_playwright
 
-from fb_nerfstudio.run_config import read_run_config
+from fb_nerfstudio.runs.run_config import read_run_config
 
 BROWSERS = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
 # WebGL in software, so that it also works where there is no graphics card.
@@ -107,7 +107,14 @@ def _training(config: Path, output: Path) -> list[Path | str]:
     """The command that goes on with a run, into another folder."""
     told = read_run_config(config)
     checkpoints = config.parent / "nerfstudio_models"
-    command = [Path(sys.executable).with_name("ns-train"), told.method_name, "--data", told.data, "--load-dir", checkpoints]
+    command = [
+        Path(sys.executable).with_name("ns-train"),
+        told.method_name,
+        "--data",
+        told.data,
+        "--load-dir",
+        checkpoints,
+    ]
     return [*command, "--output-dir", output, "--vis", "viewer", "--max-num-iterations", "1000000"]
 
 

@@ -1,7 +1,8 @@
-"""Model folders: `config.json` (every architectural choice) beside one safetensors file per network; saved whole or not at all.
+"""Model folders: `config.json` (every architectural choice) beside one safetensors file per network; saved whole or not
+at all.
 
-`load` builds the networks without allocating them and maps the files into memory, so that a model costs its weights once.
-Parameter names are those of the released checkpoints, so `convert` renames nothing.
+`load` builds the networks without allocating them and maps the files into memory, so that a model costs its weights
+once. Parameter names are those of the released checkpoints, so `convert` renames nothing.
 """
 
 import dataclasses
@@ -18,13 +19,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from fb_core.files.json_files import read_json
+from fb_core.files.limits import MOST_SIDE, is_finite, require_between, require_model_sizes
 from fb_core.files.ownership import MARK_NAME, Target
 from fb_core.files.whole import settled, whole_folder
-from fb_core.json_files import read_json
-from fb_core.limits import MOST_SIDE, is_finite, require_between, require_model_sizes
-from fb_core.networks.dit import DiT, DiTConfig
 from fb_core.networks.released import read_released
 from fb_core.networks.text import TextEncoder
+from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import adopt, require_names, require_shapes, without_weights
 
@@ -33,7 +34,11 @@ RELEASED_LICENSE = "CC BY-NC 4.0"
 CONFIG_FILE = "config.json"
 PROMPT_FILE = "empty-prompt.safetensors"
 PROMPT_KEY = "embedding"
-WEIGHT_FILES = {"transformer": "transformer.safetensors", "image_vae": "image-vae.safetensors", "raymap_vae": "raymap-vae.safetensors"}
+WEIGHT_FILES = {
+    "transformer": "transformer.safetensors",
+    "image_vae": "image-vae.safetensors",
+    "raymap_vae": "raymap-vae.safetensors",
+}
 """File of each network, by its section in the configuration."""
 
 
@@ -60,15 +65,21 @@ class ModelConfig:
 
 
 _LATER = {"ray_frames", "known_tokens"}
-"""Options of the transformer that came after the first model folders: where a folder lacks one it is the default, as released."""
+"""Options of the transformer that came after the first model folders: where a folder lacks one it is the default, as
+released.
+"""
 
 
 def _told(config: ModelConfig) -> dict[str, Any]:
-    """A configuration as its folder tells it: later options only where they are not the default, so that earlier versions read the rest."""
+    """A configuration as its folder tells it: later options only where they are not the default, so that earlier
+    versions read the rest.
+    """
     sections = dataclasses.asdict(config)
     defaults = dataclasses.asdict(DiTConfig())
     transformer = sections["transformer"]
-    sections["transformer"] = {name: value for name, value in transformer.items() if name not in _LATER or value != defaults[name]}
+    sections["transformer"] = {
+        name: value for name, value in transformer.items() if name not in _LATER or value != defaults[name]
+    }
     return sections
 
 
@@ -88,7 +99,9 @@ class Loaded:
 
 
 def model_target(folder: str | os.PathLike[str], *, overwrite: bool, inputs: tuple[Path, ...] = ()) -> Target:
-    """A model folder that is to be written; earlier ones are known by their mark, or by holding a model and nothing else."""
+    """A model folder that is to be written; earlier ones are known by their mark, or by holding a model and nothing
+    else.
+    """
     return Target(folder=Path(folder), kind="model", overwrite=overwrite, inputs=inputs, earlier=_is_model)
 
 
@@ -104,8 +117,9 @@ def save(
 ) -> Path:
     """Write a model folder, replacing an earlier model there only once the new one is complete; returns the folder.
 
-    `dtype` converts the transformer and the image autoencoder (None keeps theirs); the raymap autoencoder is stored in float32.
-    `info` must be JSON. Raises ValueError if the folder holds anything that is not a model, and CannotWrite when the disk is full.
+    `dtype` converts the transformer and the image autoencoder (None keeps theirs); the raymap autoencoder is stored in
+    float32. `info` must be JSON. Raises ValueError if the folder holds anything that is not a model, and CannotWrite
+    when the disk is full.
     """
     target = folder if isinstance(folder, Target) else model_target(folder, overwrite=True)
     require_model_or_free(target)
@@ -120,7 +134,10 @@ def save(
         for section, file in WEIGHT_FILES.items():
             stored = torch.float32 if section == "raymap_vae" else dtype
             state = modules[section].state_dict()
-            save_file({name: value.to(device="cpu", dtype=stored).contiguous() for name, value in state.items()}, unfinished / file)
+            save_file(
+                {name: value.to(device="cpu", dtype=stored).contiguous() for name, value in state.items()},
+                unfinished / file,
+            )
         if empty_prompt is not None:
             save_file({PROMPT_KEY: empty_prompt.detach().float().cpu().contiguous()}, unfinished / PROMPT_FILE)
         (unfinished / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
@@ -138,13 +155,19 @@ def require_model_or_free(target: Target) -> None:
 def _refuse_foreign(folder: Path) -> None:
     if not folder.is_dir():
         raise ValueError(f"folder: expected a model folder or a new one, but {folder} is a file.")
-    foreign = sorted({entry.name for entry in folder.iterdir()} - {CONFIG_FILE, PROMPT_FILE, MARK_NAME, *WEIGHT_FILES.values()})
+    foreign = sorted(
+        {entry.name for entry in folder.iterdir()} - {CONFIG_FILE, PROMPT_FILE, MARK_NAME, *WEIGHT_FILES.values()}
+    )
     if foreign:
-        raise ValueError(f"folder: {folder} holds {foreign[0]!r}, which is not part of a model; choose an empty or new folder.")
+        raise ValueError(
+            f"folder: {folder} holds {foreign[0]!r}, which is not part of a model; choose an empty or new folder."
+        )
 
 
 def _is_model(folder: Path) -> bool:
-    """Whether a folder without a mark has a configuration of ours; other programs write files called config.json, too."""
+    """Whether a folder without a mark has a configuration of ours; other programs write files called config.json,
+    too.
+    """
     try:
         told = read_json(folder / CONFIG_FILE)
     except (OSError, ValueError):
@@ -152,14 +175,16 @@ def _is_model(folder: Path) -> bool:
     return isinstance(told, dict) and {"format_version", "transformer", "image_vae", "raymap_vae"} <= set(told)
 
 
-def load(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", dtype: torch.dtype | None = None) -> Loaded:
+def load(
+    folder: str | os.PathLike[str], *, device: torch.device | str = "cpu", dtype: torch.dtype | None = None
+) -> Loaded:
     """Read a model folder onto a device.
 
-    `dtype` converts the transformer and the image autoencoder (None keeps the stored precision); the raymap autoencoder is always
-    float32, and beside a transformer in float16 so is the image autoencoder, whose activations would overflow. On the CPU,
-    unconverted weights stay mapped files and are shared between processes. Raises ValueError, in one sentence that names the culprit,
-    for a missing folder or file, an invalid configuration, weights of another architecture, a truncated file, and a precision that the
-    device cannot compute.
+    `dtype` converts the transformer and the image autoencoder (None keeps the stored precision); the raymap autoencoder
+    is always float32, and beside a transformer in float16 so is the image autoencoder, whose activations would
+    overflow. On the CPU, unconverted weights stay mapped files and are shared between processes. Raises ValueError, in
+    one sentence that names the culprit, for a missing folder or file, an invalid configuration, weights of another
+    architecture, a truncated file, and a precision that the device cannot compute.
     """
     folder = Path(folder)
     config, info = read_config(folder)
@@ -204,7 +229,9 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
         require_names(f"{path}, section {name!r}", expected, content[name].keys() | (_LATER & expected))
         try:
             require_model_sizes(content[name])  # before anything is built by them
-            choices: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()}
+            choices: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value for key, value in content[name].items()
+            }
             sections[name] = kind(**choices)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, section {name!r}: {error}") from error
@@ -215,7 +242,9 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
 
 
 def image_size_of(info: dict[str, Any]) -> int:
-    """Side in pixels of the views that a model was trained at, by its info; 256 where that does not say. ValueError for nonsense."""
+    """Side in pixels of the views that a model was trained at, by its info; 256 where that does not say. ValueError for
+    nonsense.
+    """
     size = info.get("image_size", 256)
     if not is_finite(size) or size % 1:
         raise ValueError(f"model: expected a whole number of pixels for image_size, got {size!r}; correct config.json")
@@ -233,7 +262,8 @@ def _open(path: Path, device: torch.device | str):
 
 
 def load_section(folder: str | os.PathLike[str], section: str, network: nn.Module) -> None:
-    """Give a network the weights of one section ("transformer", "image_vae" or "raymap_vae") of a model folder, in its own precision.
+    """Give a network the weights of one section ("transformer", "image_vae" or "raymap_vae") of a model folder, in its
+    own precision.
 
     Raises ValueError, in one sentence, for a folder that is no model and for weights that do not fit.
     """
@@ -263,11 +293,15 @@ def _require_precision(device: torch.device, dtype: torch.dtype) -> None:
     if not dtype.is_floating_point:
         raise ValueError(f"dtype: expected a floating point type, got {dtype}.")
     if device.type == "cpu" and dtype == torch.float16:
-        raise ValueError("dtype: float16 is not offered on the CPU, where it is slow and overflows; use bfloat16 or float32.")
+        raise ValueError(
+            "dtype: float16 is not offered on the CPU, where it is slow and overflows; use bfloat16 or float32."
+        )
 
 
 def autoencoder_dtype(dtype: torch.dtype) -> torch.dtype:
-    """Precision of the image autoencoder beside a transformer of `dtype`: activations of float16 would overflow, so it stays float32."""
+    """Precision of the image autoencoder beside a transformer of `dtype`: activations of float16 would overflow, so it
+    stays float32.
+    """
     return torch.float32 if dtype == torch.float16 else dtype
 
 
@@ -297,8 +331,9 @@ def convert(
 ) -> Path:
     """Turn the folder of released `.ckpt` files into a model folder; returns it.
 
-    `text_encoder` is a folder with the CLIP text model; with it, the embedding of the empty prompt is stored too, and multi-view use
-    needs CLIP no more. `overwrite` replaces an earlier model. Raises ValueError as `networks.released.read_released` and `save` do.
+    `text_encoder` is a folder with the CLIP text model; with it, the embedding of the empty prompt is stored too, and
+    multi-view use needs CLIP no more. `overwrite` replaces an earlier model. Raises ValueError as
+    `networks.released.read_released` and `save` do.
     """
     inputs = tuple(Path(given) for given in (checkpoints, text_encoder) if given is not None)
     target = model_target(output, overwrite=overwrite, inputs=inputs)
@@ -309,5 +344,11 @@ def convert(
         prompt = TextEncoder.from_folder(text_encoder).encode([""])[0]
     info = {"source": "converted from the authors' released checkpoints", "license": RELEASED_LICENSE}
     return save(
-        target, dit=released.dit, image_vae=released.image_vae, raymap_vae=released.raymap_vae, info=info, empty_prompt=prompt, dtype=dtype
+        target,
+        dit=released.dit,
+        image_vae=released.image_vae,
+        raymap_vae=released.raymap_vae,
+        info=info,
+        empty_prompt=prompt,
+        dtype=dtype,
     )

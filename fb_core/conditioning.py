@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.masks import to_latent_grid
-from fb_core.networks.dit import DiTConfig, TokenFacts
-from fb_core.networks.ray_frames import frames_of_rays
 from fb_core.networks.tiled_decoder import TiledDecoder
+from fb_core.networks.transformer.dit import DiTConfig, TokenFacts
+from fb_core.networks.transformer.ray_frames import frames_of_rays
 from fb_core.networks.vae import VAE
 
 LATENT_CHANNELS = 16
@@ -38,7 +38,9 @@ class Conditioning:
     channels: Float[Tensor, "*b 34 h w"]
     """Masked image latent, masked raymap latent, image mask, ray mask."""
     frames: Float[Tensor, "*b th tw 4 4"] | None = None
-    """Frames of the known rays of every token, for networks that attend in them; None where no ray is known, or nobody asks."""
+    """Frames of the known rays of every token, for networks that attend in them; None where no ray is known, or nobody
+    asks.
+    """
 
     def known_tokens(self, patch: int) -> Bool[Tensor, "*b th tw"]:
         """Whether all that a token of ``patch`` x ``patch`` latents shows is known, of images and of rays."""
@@ -47,7 +49,9 @@ class Conditioning:
 
     def facts(self, config: DiTConfig) -> TokenFacts:
         """What a transformer takes beside the channels, for conditionings with a batch dimension."""
-        return TokenFacts(frames=self.frames, known=self.known_tokens(config.patch) if config.known_tokens == "apart" else None)
+        return TokenFacts(
+            frames=self.frames, known=self.known_tokens(config.patch) if config.known_tokens == "apart" else None
+        )
 
     def repeated(self, times: int) -> Conditioning:
         """Every conditioning of the batch so many times in a row."""
@@ -77,7 +81,9 @@ def stacked_facts(parts: Sequence[Conditioning], config: DiTConfig) -> TokenFact
 
 
 def only_known(values: Float[Tensor, "n c h w"], known: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n c h w"]:
-    """``values`` where known (scaled by a fractional mask), 0 elsewhere. Chosen, not multiplied: NaN in unknown pixels does not survive."""
+    """``values`` where known (scaled by a fractional mask), 0 elsewhere. Chosen, not multiplied: NaN in unknown pixels
+    does not survive.
+    """
     return torch.where(known > 0, values * known, torch.zeros((), dtype=values.dtype, device=values.device))
 
 
@@ -87,9 +93,11 @@ def with_guess(
     guess: Float[Tensor, "n c h w"],
     belief: Float[Tensor, "n 1 h w"],
 ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
-    """Known pixels and, where nothing is known, guessed ones; and the mask that tells them: the belief, below 1, at guessed pixels.
+    """Known pixels and, where nothing is known, guessed ones; and the mask that tells them: the belief, below 1, at
+    guessed pixels.
 
-    A model has to be trained to be told guesses; unlike a known pixel under a fractional mask, a guess keeps its full colour.
+    A model has to be trained to be told guesses; unlike a known pixel under a fractional mask, a guess keeps its full
+    colour.
     """
     guessed = (known == 0) & (belief > 0)
     return torch.where(guessed, guess, told), torch.where(guessed, belief, known)
@@ -103,7 +111,9 @@ def assemble(
     frames: Float[Tensor, "*b th tw 4 4"] | None = None,
 ) -> Conditioning:
     """Put the encoded parts in channel order."""
-    return Conditioning(channels=torch.cat([image_latents, ray_latents, image_known, rays_known], dim=-3), frames=frames)
+    return Conditioning(
+        channels=torch.cat([image_latents, ray_latents, image_known, rays_known], dim=-3), frames=frames
+    )
 
 
 def encode_known(
@@ -122,9 +132,10 @@ def encode_known(
 ) -> Conditioning:
     """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
 
-    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a ``transformer`` that
-    attends in ray frames these are reckoned too. A ``guess`` (images, belief) is told where no pixel is known (:func:`with_guess`).
-    Images are encoded in ``precision`` (:func:`encode_frozen`) unless they are sampled; rays never are, for rounding would move cameras.
+    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a
+    ``transformer`` that attends in ray frames these are reckoned too. A ``guess`` (images, belief) is told where no
+    pixel is known (:func:`with_guess`). Images are encoded in ``precision`` (:func:`encode_frozen`) unless they are
+    sampled; rays never are, for rounding would move cameras.
     """
     told = only_known(images, image_known)
     if guess is not None:
@@ -139,16 +150,22 @@ def encode_known(
 def frames_for(
     transformer: DiTConfig | None, raymaps: Float[Tensor, "*b 6 hp wp"], rays_known: Float[Tensor, "*b 1 hp wp"]
 ) -> Float[Tensor, "*b th tw 4 4"] | None:
-    """Frames of the known rays (in [-1, 1]) of every token of a ``transformer`` that attends in them; None for any other."""
+    """Frames of the known rays (in [-1, 1]) of every token of a ``transformer`` that attends in them; None for any
+    other.
+    """
     if transformer is None or not transformer.ray_frames:
         return None
-    parts = zip(raymaps.flatten(0, -4).split(_VIEWS_AT_ONCE), rays_known.flatten(0, -4).split(_VIEWS_AT_ONCE), strict=True)
+    parts = zip(
+        raymaps.flatten(0, -4).split(_VIEWS_AT_ONCE), rays_known.flatten(0, -4).split(_VIEWS_AT_ONCE), strict=True
+    )
     frames = torch.cat([frames_of_rays(rays, known, FACTOR * transformer.patch) for rays, known in parts])
     return frames.unflatten(0, raymaps.shape[:-3])
 
 
 def encode_null(like: Conditioning, *, image_vae: VAE, raymap_vae: VAE, pixels: tuple[int, int]) -> Conditioning:
-    """The conditioning of "nothing is known", for classifier-free guidance: one black image and one raymap of zeros, encoded once."""
+    """The conditioning of "nothing is known", for classifier-free guidance: one black image and one raymap of zeros,
+    encoded once.
+    """
     image_latent = image_vae.encode(like.channels.new_zeros(1, 3, *pixels))
     ray_latent = raymap_vae.encode(like.channels.new_zeros(1, 6, *pixels))
     masks = like.channels.new_zeros(1, 2, *like.channels.shape[-2:])
@@ -164,7 +181,9 @@ def _encoded_once(
     generators: Sequence[torch.Generator] | None,
     precision: torch.dtype = torch.float32,
 ) -> Float[Tensor, "n 16 lh lw"]:
-    """Latents of what is told; views of which nothing is known, which are all alike, are encoded as one (but for samples, which differ)."""
+    """Latents of what is told; views of which nothing is known, which are all alike, are encoded as one (but for
+    samples, which differ).
+    """
     if generators is not None:
         return encode_in_chunks(vae, told, views_at_once, generators)
     something = (known > 0).flatten(1).any(dim=1)
@@ -180,9 +199,11 @@ def _encoded_once(
 def encode_in_chunks(
     vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int, generators: Sequence[torch.Generator] | None = None
 ) -> Float[Tensor, "n 16 lh lw"]:
-    """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own precision.
+    """Latents of n views, a few at a time so that memory does not grow with n. The autoencoder computes in its own
+    precision.
 
-    With a generator for each view they are samples, which depend neither on the other views nor on how many are encoded at a time.
+    With a generator for each view they are samples, which depend neither on the other views nor on how many are encoded
+    at a time.
     """
     chunks = []
     for first in range(0, len(pixels), views_at_once):
@@ -194,9 +215,11 @@ def encode_in_chunks(
 def encode_frozen(
     vae: VAE, pixels: Float[Tensor, "n c h w"], views_at_once: int, precision: torch.dtype = torch.float32
 ) -> Float[Tensor, "n 16 lh lw"]:
-    """Latents of n views by an autoencoder that is not trained, in float32, its convolutions computed in a training's ``precision``.
+    """Latents of n views by an autoencoder that is not trained, in float32, its convolutions computed in a training's
+    ``precision``.
 
-    In bfloat16 they differ by about 1.5 % (root mean square) from those in float32, and take a third of the time on a CPU that has it.
+    In bfloat16 they differ by about 1.5 % (root mean square) from those in float32, and take a third of the time on a
+    CPU that has it.
     """
     if precision == torch.float32:
         return encode_in_chunks(vae, pixels, views_at_once)
@@ -207,7 +230,9 @@ def encode_frozen(
 def decode_in_chunks(
     vae: VAE, latents: Float[Tensor, "n 16 lh lw"], views_at_once: int = 16, tile: int | None = None
 ) -> Float[Tensor, "n c h w"]:
-    """Pixels in [0, 1] of n views, a few at a time; with a `tile`, each of them in tiles of so many pixels (`TiledDecoder`)."""
+    """Pixels in [0, 1] of n views, a few at a time; with a `tile`, each of them in tiles of so many pixels
+    (`TiledDecoder`).
+    """
     decoder = None if tile is None else TiledDecoder(vae.decoder, tile)
     return torch.cat([vae.decode(chunk, clamp=True, decoder=decoder) for chunk in latents.split(views_at_once)])
 

@@ -1,4 +1,6 @@
-"""Rectified flow (paper, section 3.1): z_t = (1 - t) z + t eps with t = 0 data and t = 1 noise; the network predicts eps - z."""
+"""Rectified flow (paper, section 3.1): z_t = (1 - t) z + t eps with t = 0 data and t = 1 noise; the network predicts
+eps - z.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ Network = Callable[[Float[Tensor, "b n 32 h w"], Float[Tensor, "b"]], Float[Tens
 """State and time to velocity, the conditioning already bound."""
 
 
-def at_time(data: Float[Tensor, "b *rest"], noise: Float[Tensor, "b *rest"], time: Float[Tensor, "b"]) -> Float[Tensor, "b *rest"]:
+def at_time(
+    data: Float[Tensor, "b *rest"], noise: Float[Tensor, "b *rest"], time: Float[Tensor, "b"]
+) -> Float[Tensor, "b *rest"]:
     """The straight path's point z_t."""
     t = time.reshape(-1, *[1] * (data.ndim - 1))
     return (1 - t) * data + t * noise
@@ -23,7 +27,9 @@ def velocity(data: Float[Tensor, "*any"], noise: Float[Tensor, "*any"]) -> Float
     return noise - data
 
 
-def data_from(state: Float[Tensor, "b *rest"], predicted: Float[Tensor, "b *rest"], time: Float[Tensor, "b"]) -> Float[Tensor, "b *rest"]:
+def data_from(
+    state: Float[Tensor, "b *rest"], predicted: Float[Tensor, "b *rest"], time: Float[Tensor, "b"]
+) -> Float[Tensor, "b *rest"]:
     """The data that a velocity prediction at time t points to: z = z_t - t v."""
     return state - time.reshape(-1, *[1] * (state.ndim - 1)) * predicted
 
@@ -40,19 +46,23 @@ def masked_loss(
     *,
     channels: slice = slice(None),
 ) -> Float[Tensor, ""]:
-    """The loss of training and validation: mean squared error of some channels, 0 at positions of weight 0 (where there is no ground
-    truth, such as rays of unposed photos).
+    """The loss of training and validation: mean squared error of some channels, 0 at positions of weight 0 (where there
+    is no ground truth, such as rays of unposed photos).
 
-    The mean is over all positions, whatever their weights: so the losses of a batch's equal parts, on one process or on many, average to
-    the whole batch's, and an unposed photo among posed ones does not make their rays count for more.
+    The mean is over all positions, whatever their weights: so the losses of a batch's equal parts, on one process or on
+    many, average to the whole batch's, and an unposed photo among posed ones does not make their rays count for more.
     """
     error = (predicted - target).square()[:, :, channels]
     return error.mean() if weight is None else (error * weight).mean()
 
 
 @torch.no_grad()
-def validation_loss(network: Network, data: Float[Tensor, "b n 32 h w"], noise: Float[Tensor, "b n 32 h w"], *, steps: int = 20) -> Tensor:
-    """VAL of the paper's table 2: velocity error of image and raymap channels at ``steps`` equally spaced times. Shape [steps, 2]."""
+def validation_loss(
+    network: Network, data: Float[Tensor, "b n 32 h w"], noise: Float[Tensor, "b n 32 h w"], *, steps: int = 20
+) -> Tensor:
+    """VAL of the paper's table 2: velocity error of image and raymap channels at ``steps`` equally spaced times. Shape
+    [steps, 2].
+    """
     half = data.shape[2] // 2
     losses, wanted = [], velocity(data, noise)
     for time in torch.linspace(1.0, 1.0 / steps, steps).tolist():

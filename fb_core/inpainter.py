@@ -1,4 +1,6 @@
-"""Fillerbuster: complete any mix of known, partly known and unknown images and raymaps of one scene (paper, section 3.1)."""
+"""Fillerbuster: complete any mix of known, partly known and unknown images and raymaps of one scene (paper, section
+3.1).
+"""
 
 from __future__ import annotations
 
@@ -15,25 +17,37 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core import checkpoint
-from fb_core.conditioning import LATENT_CHANNELS, decode_in_chunks, encode_in_chunks, encode_known, encode_null, only_known, split, unsplit
+from fb_core.conditioning import (
+    LATENT_CHANNELS,
+    decode_in_chunks,
+    encode_in_chunks,
+    encode_known,
+    encode_null,
+    only_known,
+    split,
+    unsplit,
+)
 from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
+from fb_core.machine.precision import resolved
 from fb_core.masks import to_latent_grid
-from fb_core.memory import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
-from fb_core.networks.precision import resolved
+from fb_core.memory.budget import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
+from fb_core.sampling.integration.trajectory import OnStep, SamplingInterrupted
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.preview import Progress
 from fb_core.sampling.randomness import noise_of, posterior_generators, random_orders
 from fb_core.sampling.starts import known_latents
-from fb_core.sampling.trajectory import OnStep, SamplingInterrupted
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
 _LATENT_PIXELS = 8  # side of what one latent stands for
 _STARTS = 4  # steps in which a mask between 0 and 1 says when a latent joins the sampling
-_FARTHEST = {"pixels": 1e4, "rays": 1e12}  # known values beyond are no colours or places, and their squares would overflow
+_FARTHEST = {
+    "pixels": 1e4,
+    "rays": 1e12,
+}  # known values beyond are no colours or places, and their squares would overflow
 _logger = logging.getLogger(__name__)
 
 
@@ -41,8 +55,12 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
-def _in_own_precision(method: Callable[Concatenate[Fillerbuster, _P], _R]) -> Callable[Concatenate[Fillerbuster, _P], _R]:
-    """Keep a caller's autocast out: what is computed in which precision is said by the model and by the sampling options."""
+def _in_own_precision(
+    method: Callable[Concatenate[Fillerbuster, _P], _R],
+) -> Callable[Concatenate[Fillerbuster, _P], _R]:
+    """Keep a caller's autocast out: what is computed in which precision is said by the model and by the sampling
+    options.
+    """
 
     @functools.wraps(method)
     def called(self: Fillerbuster, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -82,10 +100,11 @@ class Fillerbuster:
     ) -> Fillerbuster:
         """Load a model folder (config.json and safetensors); None is the small bundled model.
 
-        `dtype` is the transformer's and the image autoencoder's precision (the latter stays in float32 beside float16); norms, the
-        residual stream, guidance and the raymap autoencoder are always in float32. `text_encoder` is a folder with the CLIP text
-        model, which prompts need. Raises ValueError, in one sentence, for a missing folder or file, foreign or truncated weights, a
-        precision that the device cannot compute, and a text encoder beside a model that reads no text.
+        `dtype` is the transformer's and the image autoencoder's precision (the latter stays in float32 beside float16);
+        norms, the residual stream, guidance and the raymap autoencoder are always in float32. `text_encoder` is a
+        folder with the CLIP text model, which prompts need. Raises ValueError, in one sentence, for a missing folder or
+        file, foreign or truncated weights, a precision that the device cannot compute, and a text encoder beside a
+        model that reads no text.
         """
         path = BUNDLED_MODEL if folder is None else Path(folder)
         loaded = checkpoint.load(path, device=device, dtype=dtype)
@@ -119,7 +138,9 @@ class Fillerbuster:
     def estimate(
         self, views: int, size: tuple[int, int], sampling: SamplingConfig | None = None, *, prompt: str | None = None
     ) -> MemoryEstimate:
-        """Memory that `complete` will need for so many views of a size (height, width); see `fb_core.memory.estimate`."""
+        """Memory that `complete` will need for so many views of a size (height, width); see
+        `fb_core.memory.budget.estimate`.
+        """
         sampling = self.recommended_sampling if sampling is None else sampling
         prompted = bool(prompt) and sampling.guidance_text != 0
         return estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
@@ -141,23 +162,27 @@ class Fillerbuster:
         """Fill all that is unknown; known pixels and rays are returned as given, and all masks are 1.
 
         Args:
-            views: 1 or more views with sides of at least 16 pixels (sides that 16 does not divide are padded with unknown pixels).
+            views: 1 or more views with sides of at least 16 pixels (sides that 16 does not divide are padded with
+                unknown pixels).
             generator: decides the sample, on the CPU. Each view's noise depends only on it and on the view's place.
             sampling: steps, guidance, windows, memory; None is `recommended_sampling`.
             on_step: called with (steps done, steps in all).
-            on_progress: called after every step with the step, the time reached, and a cheap preview that is made only when asked for.
+            on_progress: called after every step with the step, the time reached, and a cheap preview that is made only
+                when asked for.
             prompt: says what is to be seen, for models that read text; None and "" cost nothing.
-            current: views of the same number and size, such as an earlier answer, that sampling starts from at a strength below 1,
-                except where `views` knows better. Latents of which they do not know all pixels start from noise; the others join them
-                at the strength. With `sampling.guess` they are (also) told as a guess: where no pixel is known, theirs are, to be
-                believed as far as `sampling.belief` and their own mask say.
-            resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not drawn from.
+            current: views of the same number and size, such as an earlier answer, that sampling starts from at a
+                strength below 1, except where `views` knows better. Latents of which they do not know all pixels start
+                from noise; the others join them at the strength. With `sampling.guess` they are (also) told as a guess:
+                where no pixel is known, theirs are, to be believed as far as `sampling.belief` and their own mask say.
+            resume: goes on with an interrupted call that had the same arguments, to the same bits; the generator is not
+                drawn from.
 
         Raises:
-            SamplingInterrupted: a KeyboardInterrupt while denoising. Model and arguments are as they were; the error holds the trajectory
-                as far as it got, for `resume`.
-            ValueError: for no views, views that are too small, pixels or rays in integers, known ones that are not finite or far out of
-                range, a prompt that the model cannot read, or too little memory however the work is cut (saying what would fit).
+            SamplingInterrupted: a KeyboardInterrupt while denoising. Model and arguments are as they were; the error
+                holds the trajectory as far as it got, for `resume`.
+            ValueError: for no views, views that are too small, pixels or rays in integers, known ones that are not
+                finite or far out of range, a prompt that the model cannot read, or too little memory however the work
+                is cut (saying what would fit).
         """
         _check(views)
         sampling = self.recommended_sampling if sampling is None else sampling
@@ -182,9 +207,13 @@ class Fillerbuster:
             else:
                 started = self._encoded(current, padded, frame, cut)
         denoising = self._denoising(padded, frame, started, counts, text, seed, sampling, cut, guess)
-        look = None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
+        look = (
+            None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
+        )
         try:
-            latents = denoising.run(on_step=on_step, on_trajectory=look, resume=None if resume is None else resume.trajectory)
+            latents = denoising.run(
+                on_step=on_step, on_trajectory=look, resume=None if resume is None else resume.trajectory
+            )
         except SamplingInterrupted as stopped:
             stopped.seed = seed
             raise
@@ -194,7 +223,8 @@ class Fillerbuster:
     def recover_raymaps(
         self, images: Float[Tensor, "n 3 h w"], *, generator: torch.Generator, sampling: SamplingConfig | None = None
     ) -> Float[Tensor, "n 6 h w"]:
-        """Raymaps of photos without poses (paper, "Raymap prediction"), in a canonical frame of their own: the cube [-1, 1]^3.
+        """Raymaps of photos without poses (paper, "Raymap prediction"), in a canonical frame of their own: the cube
+        [-1, 1]^3.
 
         None samples as `recommended_sampling.for_poses()` says. Raises as `complete` does.
         """
@@ -209,7 +239,8 @@ class Fillerbuster:
             return None
         if self.text is None:
             raise ValueError(
-                "complete: this model reads text, but its folder has no embedding of the empty prompt; convert it with a text encoder, "
+                "complete: this model reads text, but its folder has no embedding of the empty prompt; convert it "
+                "with a text encoder, "
                 "or load it with from_pretrained(..., text_encoder=FOLDER)"
             )
         if not prompt:
@@ -290,21 +321,32 @@ class Fillerbuster:
             branches_at_once=cut.branches,
         )
 
-    def _encoded(self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut) -> Float[Tensor, "n 32 h w"]:
+    def _encoded(
+        self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut
+    ) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
-        whole = (current.image_known > 0).to(current.image_known)  # a mask below 1 says when a pixel joins, not how dark it is
-        images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(current.images, whole)
+        whole = (current.image_known > 0).to(
+            current.image_known
+        )  # a mask below 1 says when a pixel joins, not how dark it is
+        images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(
+            current.images, whole
+        )
         raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps.to(views.raymaps))
         there = views.rays_known.maximum(current.rays_known) > 0
         raymaps = torch.where(there, raymaps, 0.0)
         raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1).float()
-        raymaps01 = torch.where(there, raymaps01, 0.0)  # as in what is known; 0 of the world would be a place that depends on the world
+        raymaps01 = torch.where(
+            there, raymaps01, 0.0
+        )  # as in what is known; 0 of the world would be a place that depends on the world
         return unsplit(
-            encode_in_chunks(self.image_vae, images, cut.views_encoded), encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded)
+            encode_in_chunks(self.image_vae, images, cut.views_encoded),
+            encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded),
         )
 
     def _decode(self, views: Views, latents: Tensor, frame: CanonicalFrame | None, cut: Cut) -> Views:
-        """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not decoded."""
+        """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not
+        decoded.
+        """
         image_latents, ray_latents = split(latents)
         images = only_known(views.images, views.image_known)
         todo = (views.image_known < 1).flatten(1).any(dim=1)
@@ -315,7 +357,9 @@ class Fillerbuster:
         raymaps = torch.where(views.rays_known > 0, views.raymaps, 0.0)
         todo = (views.rays_known <= 0).flatten(1).any(dim=1)
         if bool(todo.any()):
-            recovered = from_unit_range(decode_in_chunks(self.raymap_vae, ray_latents[todo], cut.views_decoded, cut.tile)).to(raymaps)
+            recovered = from_unit_range(
+                decode_in_chunks(self.raymap_vae, ray_latents[todo], cut.views_decoded, cut.tile)
+            ).to(raymaps)
             recovered = recovered if frame is None else frame.invert(recovered)
             raymaps[todo] = torch.where(views.rays_known[todo] > 0, raymaps[todo], recovered)
         ones = torch.ones_like(views.image_known)
@@ -327,20 +371,28 @@ def _check(views: Views) -> None:
         raise ValueError("complete: expected at least one view, got none")
     if min(views.size) < SIDE_MULTIPLE:
         raise ValueError(
-            f"complete: expected views of at least {SIDE_MULTIPLE}x{SIDE_MULTIPLE} pixels, got {views.size[1]}x{views.size[0]}; "
+            f"complete: expected views of at least {SIDE_MULTIPLE}x{SIDE_MULTIPLE} pixels, got "
+            f"{views.size[1]}x{views.size[0]}; "
             "use larger images"
         )
     for what, values, known in (("pixels", views.images, views.image_known), ("rays", views.raymaps, views.rays_known)):
         if not bool(torch.isfinite(known).all()) or float(known.min()) < 0 or float(known.max()) > 1:
             raise ValueError(f"complete: the mask of known {what} must lie in [0, 1] (1 = known)")
         if not values.is_floating_point():
-            raise ValueError(f"complete: expected {what} in floating-point numbers, got {values.dtype}; colours are in [0, 1]")
+            raise ValueError(
+                f"complete: expected {what} in floating-point numbers, got {values.dtype}; colours are in [0, 1]"
+            )
         broken = int(((~torch.isfinite(values)) & (known > 0)).any(dim=1).sum())
         if broken:
-            raise ValueError(f"complete: {broken} known {what} are NaN or infinite; mark them as unknown (mask 0) or repair them")
+            raise ValueError(
+                f"complete: {broken} known {what} are NaN or infinite; mark them as unknown (mask 0) or repair them"
+            )
         far = int(((values.abs() > _FARTHEST[what]) & (known > 0)).any(dim=1).sum())
         if far:
-            raise ValueError(f"complete: {far} known {what} are beyond {_FARTHEST[what]:g}; mark them as unknown (mask 0) or scale them")
+            raise ValueError(
+                f"complete: {far} known {what} are beyond {_FARTHEST[what]:g}; mark them as unknown (mask 0) or scale "
+                "them"
+            )
 
 
 def _check_current(current: Views, views: Views) -> None:
@@ -349,13 +401,17 @@ def _check_current(current: Views, views: Views) -> None:
         raise ValueError(f"current: expected {expected} like the views to be completed, got {got}")
     pixels, rays = only_known(current.images, current.image_known), only_known(current.raymaps, current.rays_known)
     if not bool(torch.isfinite(pixels).all() & torch.isfinite(rays).all()):
-        raise ValueError("current: pixels or rays are NaN or infinite; pass whole views, such as an earlier answer of complete")
+        raise ValueError(
+            "current: pixels or rays are NaN or infinite; pass whole views, such as an earlier answer of complete"
+        )
 
 
 def _counting(current: Views, views: Views) -> Float[Tensor, "n 32 h w"] | None:
-    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones add nothing.
+    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones
+    add nothing.
 
-    Where the least known pixel of a latent has a mask between 0 and 1 in the current views it is that, in quarters: it starts in between.
+    Where the least known pixel of a latent has a mask between 0 and 1 in the current views it is that, in quarters: it
+    starts in between.
     """
     rays_known = views.rays_known.maximum(current.rays_known)
     known = known_latents(to_latent_grid(views.image_known), to_latent_grid(views.rays_known))
@@ -373,7 +429,9 @@ def _padded(views: Views, *, mode: str = "constant") -> Views:
     extra = (0, -width % SIDE_MULTIPLE, 0, -height % SIDE_MULTIPLE)
     if not any(extra):
         return views
-    return dataclasses.replace(views, **{f.name: F.pad(getattr(views, f.name), extra, mode=mode) for f in dataclasses.fields(Views)})
+    return dataclasses.replace(
+        views, **{f.name: F.pad(getattr(views, f.name), extra, mode=mode) for f in dataclasses.fields(Views)}
+    )
 
 
 def _working(views: Views, device: torch.device) -> Views:
@@ -386,7 +444,10 @@ def _working(views: Views, device: torch.device) -> Views:
 def _as_given(filled: Views, views: Views) -> Views:
     """Cut to the size of the views, on their device and in their precision; what they know keeps its bits."""
     height, width = views.size
-    cut = {f.name: getattr(filled, f.name)[..., :height, :width].to(getattr(views, f.name)) for f in dataclasses.fields(Views)}
+    cut = {
+        f.name: getattr(filled, f.name)[..., :height, :width].to(getattr(views, f.name))
+        for f in dataclasses.fields(Views)
+    }
     cut["images"] = torch.where(views.image_known < 1, cut["images"], views.images)
     cut["raymaps"] = torch.where(views.rays_known > 0, views.raymaps, cut["raymaps"])
     return Views(**cut)

@@ -1,4 +1,6 @@
-"""Known-masks (1 = known): the training mixture, conditioning dropout, growing a hole, pictures and masks on another grid."""
+"""Known-masks (1 = known): the training mixture, conditioning dropout, growing a hole, pictures and masks on another
+grid.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +16,34 @@ WHOLLY = 1 - 1e-3
 """Share of known pixels from which on a resampled pixel counts as known altogether."""
 _LEAST_SHARE = 1e-6  # below, a share is rounding of the resampling, and a colour divided by it would be too
 Resampler = Callable[[Tensor], Tensor]
-"""Takes channels [c, h, w] to channels [c, h2, w2], each channel alike, as means with weights of 0 or more that add up to 1 at most."""
+"""Takes channels [c, h, w] to channels [c, h2, w2], each channel alike, as means with weights of 0 or more that add up
+to 1 at most.
+"""
 
 
-def rotated_rectangle(height: int, width: int, *, center: tuple[float, float], size: tuple[float, float], angle_radians: float) -> Tensor:
-    """1 inside a rotated rectangle, 0 outside, tested at the pixel centres; center (y, x) and size (h, w) in pixels. Shape [h, w]."""
+def rotated_rectangle(
+    height: int, width: int, *, center: tuple[float, float], size: tuple[float, float], angle_radians: float
+) -> Tensor:
+    """1 inside a rotated rectangle, 0 outside, tested at the pixel centres; center (y, x) and size (h, w) in pixels.
+    Shape [h, w].
+    """
     y, x = torch.meshgrid(torch.arange(height) + 0.5 - center[0], torch.arange(width) + 0.5 - center[1], indexing="ij")
     along = x * math.cos(angle_radians) + y * math.sin(angle_radians)
     across = -x * math.sin(angle_radians) + y * math.cos(angle_radians)
     return ((along.abs() <= size[1] / 2) & (across.abs() <= size[0] / 2)).float()
 
 
-def partly_known(height: int, width: int, *, generator: torch.Generator, device: torch.device | str = "cpu") -> Float[Tensor, "1 h w"]:
+def partly_known(
+    height: int, width: int, *, generator: torch.Generator, device: torch.device | str = "cpu"
+) -> Float[Tensor, "1 h w"]:
     """A mask with 2 to 10 unknown rotated rectangles of 10 to 50 % of the image's side (paper, "Masking out regions").
 
     The draws are those of the generator, on the CPU; the mask is made on the device, all rectangles at once.
     """
-    draws = [torch.rand(5, generator=generator, dtype=torch.float32) for _ in range(int(torch.randint(2, 11, (), generator=generator)))]
+    draws = [
+        torch.rand(5, generator=generator, dtype=torch.float32)
+        for _ in range(int(torch.randint(2, 11, (), generator=generator)))
+    ]
     size_y, size_x, y, x, turn = torch.stack(draws).double().to(device)[..., None, None].unbind(1)
     down, along_row = ((torch.arange(side, device=device) + 0.5).double() for side in (height, width))
     down, right = down[:, None] - y * height, along_row - x * width
@@ -51,10 +64,11 @@ def training_mixture(
     in_order: bool = False,
     device: torch.device | str = "cpu",
 ) -> Float[Tensor, "n 1 h w"]:
-    """Masks of one training sequence: by default a quarter of the views known, half unknown, the rest partly known, in random order.
+    """Masks of one training sequence: by default a quarter of the views known, half unknown, the rest partly known, in
+    random order.
 
-    ``known`` and ``unknown`` override the two counts (the released code's split is n//4 and n//2). ``in_order`` keeps known views first,
-    then unknown ones, then the rest, as in the paper's evaluation.
+    ``known`` and ``unknown`` override the two counts (the released code's split is n//4 and n//2). ``in_order`` keeps
+    known views first, then unknown ones, then the rest, as in the paper's evaluation.
     """
     known = count // 4 if known is None else known
     unknown = count // 2 if unknown is None else unknown
@@ -69,7 +83,9 @@ def training_mixture(
 
 
 def drop_conditioning(generator: torch.Generator, *, share: float = 0.1) -> tuple[bool, bool]:
-    """(drop images, drop rays): with probability ``share`` something is dropped, equally images, rays, or both (paper, appendix)."""
+    """(drop images, drop rays): with probability ``share`` something is dropped, equally images, rays, or both (paper,
+    appendix).
+    """
     if float(torch.rand((), generator=generator, dtype=torch.float32)) >= share:
         return False, False
     which = int(torch.randint(0, 3, (), generator=generator))
@@ -84,17 +100,23 @@ def grow_hole(known: Float[Tensor, "n 1 h w"], *, pixels: int) -> Float[Tensor, 
 
 
 def to_latent_grid(known: Float[Tensor, "n 1 h w"], *, factor: int = 8) -> Float[Tensor, "n 1 lh lw"]:
-    """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples of ``factor``."""
+    """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples
+    of ``factor``.
+    """
     height, width = known.shape[-2:]
     if height % factor or width % factor or not height or not width:
-        raise ValueError(f"latent grid: expected a mask whose sides are multiples of {factor} pixels, got {width}x{height}; pad it first")
+        raise ValueError(
+            f"latent grid: expected a mask whose sides are multiples of {factor} pixels, got {width}x{height}; pad it "
+            "first"
+        )
     return F.avg_pool2d(known, kernel_size=factor)
 
 
 def resampled(
     image: Float[Tensor, "c h w"], known: Float[Tensor, "1 h w"], how: Resampler
 ) -> tuple[Float[Tensor, "c h2 w2"], Float[Tensor, "1 h2 w2"]]:
-    """Colours, not multiplied by anything, and the share of each new pixel that is known; colours are black where the share is 0.
+    """Colours, not multiplied by anything, and the share of each new pixel that is known; colours are black where the
+    share is 0.
 
     Args:
         image: any colours; what stands in unknown pixels may be anything, NaN included.
@@ -112,7 +134,9 @@ def resampled(
 def wholly_known(
     image: Float[Tensor, "c h w"], known: Float[Tensor, "1 h w"], how: Resampler, *, least: float = WHOLLY
 ) -> tuple[Float[Tensor, "c h2 w2"], Float[Tensor, "1 h2 w2"]]:
-    """Like :func:`resampled`, for what networks see and splats learn: 1 where a share of at least ``least`` is known, else black and 0."""
+    """Like :func:`resampled`, for what networks see and splats learn: 1 where a share of at least ``least`` is known,
+    else black and 0.
+    """
     colours, share = resampled(image, known, how)
     whole = (share >= least).to(share)
     return torch.where(whole > 0, colours, torch.zeros_like(colours)), whole

@@ -36,7 +36,9 @@ class Views:
         for name, channels in expected.items():
             got = tuple(getattr(self, name).shape)
             if got != (count, channels, height, width):
-                raise ValueError(f"Views: {name} has shape {got}, expected {(count, channels, height, width)} like the images")
+                raise ValueError(
+                    f"Views: {name} has shape {got}, expected {(count, channels, height, width)} like the images"
+                )
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -45,7 +47,9 @@ class Views:
         """The chosen views; an integer keeps the leading dimension."""
         if isinstance(index, numbers.Integral):  # NumPy's integers too
             index = [int(index)]
-        return dataclasses.replace(self, **{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)})
+        return dataclasses.replace(
+            self, **{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)}
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -54,13 +58,18 @@ class Views:
 
     def to(self, *args, **kwargs) -> Views:
         """Like ``Tensor.to`` for every tensor."""
-        return dataclasses.replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in dataclasses.fields(self)})
+        return dataclasses.replace(
+            self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in dataclasses.fields(self)}
+        )
 
     @staticmethod
-    def known(images: Float[Tensor, "n 3 h w"], cameras: Pinholes, *, mask: Float[Tensor, "n 1 h w"] | None = None) -> Views:
+    def known(
+        images: Float[Tensor, "n 3 h w"], cameras: Pinholes, *, mask: Float[Tensor, "n 1 h w"] | None = None
+    ) -> Views:
         """Captured views with known cameras; ``mask`` marks the known pixels (default: all).
 
-        Rays keep the cameras' precision where that is the higher one: single precision knows no millimetre far from the origin.
+        Rays keep the cameras' precision where that is the higher one: single precision knows no millimetre far from the
+        origin.
         """
         ones, rays = torch.ones_like(images[:, :1]), raymaps_of(cameras)
         rays = rays.to(images.device, torch.promote_types(images.dtype, rays.dtype))
@@ -71,14 +80,19 @@ class Views:
         """Views that are to be generated at known cameras."""
         raymaps = raymaps_of(cameras)
         zeros = torch.zeros_like(raymaps[:, :1])
-        return Views(images=zeros.expand(-1, 3, -1, -1), image_known=zeros, raymaps=raymaps, rays_known=torch.ones_like(zeros))
+        return Views(
+            images=zeros.expand(-1, 3, -1, -1), image_known=zeros, raymaps=raymaps, rays_known=torch.ones_like(zeros)
+        )
 
     @staticmethod
     def unposed(images: Float[Tensor, "n 3 h w"]) -> Views:
         """Known images whose cameras are to be recovered."""
         ones = torch.ones_like(images[:, :1])
         return Views(
-            images=images, image_known=ones, raymaps=torch.zeros_like(ones).expand(-1, 6, -1, -1), rays_known=torch.zeros_like(ones)
+            images=images,
+            image_known=ones,
+            raymaps=torch.zeros_like(ones).expand(-1, 6, -1, -1),
+            rays_known=torch.zeros_like(ones),
         )
 
     @staticmethod
@@ -86,7 +100,10 @@ class Views:
         """All views in one sequence. Raises ValueError when the sizes differ."""
         sizes = {group.size for group in groups}
         if len(sizes) != 1:
-            raise ValueError(f"views of one sequence must share one size (height, width), got {sorted(sizes)}; fit them first")
+            raise ValueError(
+                f"views of one sequence must share one size (height, width), got {sorted(sizes)}; fit them first"
+            )
         return dataclasses.replace(
-            groups[0], **{f.name: torch.cat([getattr(group, f.name) for group in groups]) for f in dataclasses.fields(Views)}
+            groups[0],
+            **{f.name: torch.cat([getattr(group, f.name) for group in groups]) for f in dataclasses.fields(Views)},
         )

@@ -1,4 +1,6 @@
-"""nerfstudio's cameras and batches <-> our types. Beside ``fb_core.data.captures`` the only place that knows OpenGL axes."""
+"""nerfstudio's cameras and batches <-> our types. Beside ``fb_core.data.capture.captures`` the only place that knows
+OpenGL axes.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,14 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 
-# nerfstudio undistorts these into pinhole images when it caches a dataset, but leaves type and coefficients as they were.
+# nerfstudio undistorts these into pinhole images when it caches a dataset, but leaves type and coefficients as they
+# were.
 _PINHOLE_AFTER_CACHING = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
 
 
 def flip_axes(camera_to_world: Float[Tensor, "*n 3 4"]) -> Float[Tensor, "*n 3 4"]:
-    """OpenGL camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward), or back: it is its own inverse.
+    """OpenGL camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward), or back: it is its own
+    inverse.
 
     Negates the second and third column; centres stay. Exact in floating point, differentiable.
     """
@@ -35,12 +39,15 @@ def to_pinholes(cameras: Cameras) -> Pinholes:
         raise ValueError("cameras: got none, expected at least one camera")
     if not bool((sizes == sizes[0]).all()):
         distinct = sorted({tuple(size) for size in sizes.tolist()})
-        raise ValueError(f"cameras: expected one image size, got (width, height) {distinct}; use to_pinhole_list for mixed sizes")
+        raise ValueError(
+            f"cameras: expected one image size, got (width, height) {distinct}; use to_pinhole_list for mixed sizes"
+        )
     width, height = sizes[0].tolist()
     poses = cameras.camera_to_worlds  # whole numbers, where a camera path was written so
     poses = poses.to(torch.promote_types(poses.dtype, torch.float32))
     focal, principal = (
-        torch.stack([x.reshape(-1), y.reshape(-1)], dim=-1) for x, y in ((cameras.fx, cameras.fy), (cameras.cx, cameras.cy))
+        torch.stack([x.reshape(-1), y.reshape(-1)], dim=-1)
+        for x, y in ((cameras.fx, cameras.fy), (cameras.cx, cameras.cy))
     )
     return Pinholes(
         camera_to_world=flip_axes(poses.reshape(-1, 3, 4)),
@@ -77,7 +84,9 @@ def to_nerfstudio(pinholes: Pinholes, device: torch.device | str | None = None) 
 
 
 def batch_image(batch: dict, device: torch.device | str | None = None) -> Float[Tensor, "3 h w"]:
-    """RGB in [0, 1] of ``batch["image"]`` ([h, w, 3 or 4], uint8 or float). An alpha channel is dropped, see :func:`batch_known`."""
+    """RGB in [0, 1] of ``batch["image"]`` ([h, w, 3 or 4], uint8 or float). An alpha channel is dropped, see
+    :func:`batch_known`.
+    """
     image = _unit_range(batch["image"], "image")
     if image.ndim != 3 or image.shape[-1] not in (3, 4):
         raise ValueError(f"batch['image']: expected a shape [h, w, 3 or 4], got {list(image.shape)}")
@@ -85,13 +94,21 @@ def batch_image(batch: dict, device: torch.device | str | None = None) -> Float[
 
 
 def batch_known(batch: dict, device: torch.device | str | None = None) -> Float[Tensor, "1 h w"]:
-    """The known-mask (1 = known) of a batch: its ``mask`` ([h, w, 1]) times the image's alpha; all ones without either."""
+    """The known-mask (1 = known) of a batch: its ``mask`` ([h, w, 1]) times the image's alpha; all ones without
+    either.
+    """
     image = batch["image"]
-    known = _unit_range(image, "image")[..., 3:] if image.shape[-1] == 4 else torch.ones(*image.shape[:2], 1, device=image.device)
+    known = (
+        _unit_range(image, "image")[..., 3:]
+        if image.shape[-1] == 4
+        else torch.ones(*image.shape[:2], 1, device=image.device)
+    )
     if "mask" in batch:
         mask = batch["mask"]
         if mask.shape[:2] != image.shape[:2]:
-            raise ValueError(f"batch['mask']: expected the image's size {list(image.shape[:2])}, got {list(mask.shape[:2])}")
+            raise ValueError(
+                f"batch['mask']: expected the image's size {list(image.shape[:2])}, got {list(mask.shape[:2])}"
+            )
         known = known * _unit_range(mask.reshape(*mask.shape[:2], 1), "mask").to(known.device)
     return known.movedim(-1, 0).contiguous().to(device)
 
@@ -110,4 +127,6 @@ def _require_pinhole(cameras: Cameras) -> None:
     found = set(cameras.camera_type.reshape(-1).tolist()) - allowed
     if found:
         names = ", ".join(sorted(CameraType(kind).name for kind in found))
-        raise ValueError(f"cameras: expected pinhole cameras, got {names}; convert these images to perspective views first")
+        raise ValueError(
+            f"cameras: expected pinhole cameras, got {names}; convert these images to perspective views first"
+        )

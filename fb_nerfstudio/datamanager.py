@@ -18,32 +18,13 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from fb_core.data.captures import Frame
-from fb_core.files.whole import remove_folder
-from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.shell import Shell
-from fb_core.networks.precision import in_words
-from fb_nerfstudio.all_or_nothing import undone_on_error
-from fb_nerfstudio.bank import Bank, without_requested
-from fb_nerfstudio.brought_views import announcement_of_brought, brought_views, takes_brought
-from fb_nerfstudio.captured_views import CapturedViewsDatamanager
-from fb_nerfstudio.completed_views import CompletedViews, round_title, views_target
-from fb_nerfstudio.completion import Inpainter, announcement, open_cache, run_completion
-from fb_nerfstudio.completion_config import CompletionConfig
-from fb_nerfstudio.completion_plan import CompletionPlan, plan_completion
-from fb_nerfstudio.dataparser import NerfstudioWithoutOpen3d, without_open3d
-from fb_nerfstudio.exports import refuse_empty_exports
-from fb_nerfstudio.first_guess import first_guess
-from fb_nerfstudio.fitting_in import fitted_in, needed_by_splats
-from fb_nerfstudio.generation import Bars, LazyViews, own_randomness, refusing, release_memory, save_checkpoint, say_found, splats_of
-from fb_nerfstudio.going_on import CaptureIdentity
-from fb_nerfstudio.grid_inpainter import GridInpainter
-from fb_nerfstudio.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
-from fb_nerfstudio.lazy_inpainter import LazyInpainter
-from fb_nerfstudio.missing import plan_missing
-from fb_nerfstudio.next_round import Rounds, due_after, former_of, in_turn
-from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
-from fb_nerfstudio.requests import (
+from fb_core.completion.brought_views import announcement_of_brought, brought_views, takes_brought
+from fb_core.completion.inpainters.grid_inpainter import GridInpainter
+from fb_core.completion.inpainters.lazy_inpainter import LazyInpainter
+from fb_core.completion.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
+from fb_core.completion.options import CompletionConfig
+from fb_core.completion.planning.plan import CompletionPlan, plan_completion
+from fb_core.completion.requests import (
     CompleteFrom,
     CompleteMissing,
     RegenerateRound,
@@ -55,10 +36,38 @@ from fb_nerfstudio.requests import (
     standing_on,
     without_view,
 )
-from fb_nerfstudio.start_points import start_points
-from fb_nerfstudio.trust import Trust, measured_trust
-from fb_nerfstudio.trusted_views import surroundings_of
-from fb_nerfstudio.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
+from fb_core.completion.results.completed_views import CompletedViews, round_title, views_target
+from fb_core.completion.rounds import Inpainter, announcement, open_cache, run_completion
+from fb_core.completion.trust import Trust, measured_trust
+from fb_core.data.capture.frames import Frame
+from fb_core.files.whole import remove_folder
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.shell import Shell
+from fb_core.machine.precision import in_words
+from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager
+from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.capture.start_points import start_points
+from fb_nerfstudio.capture.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
+from fb_nerfstudio.checks.exports import refuse_empty_exports
+from fb_nerfstudio.checks.going_on import CaptureIdentity
+from fb_nerfstudio.generation.bank import Bank, without_requested
+from fb_nerfstudio.generation.first_guess import first_guess
+from fb_nerfstudio.generation.fitting_in import fitted_in, needed_by_splats
+from fb_nerfstudio.generation.missing import plan_missing
+from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn
+from fb_nerfstudio.generation.surroundings import (
+    Bars,
+    LazyViews,
+    own_randomness,
+    refusing,
+    release_memory,
+    save_checkpoint,
+    say_found,
+    splats_of,
+)
+from fb_nerfstudio.generation.trusted_views import surroundings_of
+from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
+from fb_nerfstudio.splats.all_or_nothing import undone_on_error
 from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
 COMPLETION_FOLDER = "completion"
@@ -75,7 +84,9 @@ class FillerbusterDataManagerConfig(FullImageDatamanagerConfig):
     completion: CompletionConfig = field(default_factory=CompletionConfig)
     """Generating views of what the capture has not seen."""
     start_points: int = 5000
-    """Captures without a point cloud: triangulate the photos' features, and fill up to this many points; 0 starts at random in a cube."""
+    """Captures without a point cloud: triangulate the photos' features, and fill up to this many points; 0 starts at
+    random in a cube.
+    """
 
     def __post_init__(self) -> None:
         if self.start_points < 0:
@@ -85,9 +96,9 @@ class FillerbusterDataManagerConfig(FullImageDatamanagerConfig):
 class FillerbusterDataManager(CapturedViewsDatamanager):
     """Captured views as in nerfstudio, plus generated views in a bank of their own.
 
-    Generated views never enter the training dataset: its size is frozen into camera optimizers and strategies. They come
-    without ``cam_idx``, are stored in the checkpoint, and are generated by a callback before the iteration that needs them.
-    The diffusion model lives only inside that callback.
+    Generated views never enter the training dataset: its size is frozen into camera optimizers and strategies. They
+    come without ``cam_idx``, are stored in the checkpoint, and are generated by a callback before the iteration that
+    needs them. The diffusion model lives only inside that callback.
     """
 
     config: FillerbusterDataManagerConfig
@@ -103,7 +114,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
     ):
         if world_size > 1:
             raise Refused(
-                f"fillerbuster trains in one process, got {world_size}: splats that grow cannot be shared; use --machine.num-devices 1"
+                f"fillerbuster trains in one process, got {world_size}: splats that grow cannot be shared; use "
+                "--machine.num-devices 1"
             )
         if test_mode == "val":  # a training; evaluation commands read what a training has already accepted
             refuse_bad_capture(config)
@@ -112,9 +124,15 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         without_open3d(config.dataparser)
         super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._own_points: torch.Tensor | None = None
-        if test_mode == "val" and config.start_points > 0 and "points3D_xyz" not in self.train_dataparser_outputs.metadata:
+        if (
+            test_mode == "val"
+            and config.start_points > 0
+            and "points3D_xyz" not in self.train_dataparser_outputs.metadata
+        ):
             self._find_start_points()
-        self.completion_panel = CompletionPanel(prompt=config.completion.prompt)  # public: nerfstudio's viewer looks for it by type
+        self.completion_panel = CompletionPanel(
+            prompt=config.completion.prompt
+        )  # public: nerfstudio's viewer looks for it by type
         self.completion_panel.captured = len(self.train_dataset)
         self._bank: Bank | None = None
         self._finished = False
@@ -127,7 +145,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
     def _find_start_points(self) -> None:
         """Give the pipeline points to start the splats from, where the capture brings none."""
         CONSOLE.print("The capture has no point cloud: triangulating its photos.")
-        points, colors = start_points(self.train_dataparser_outputs, count=self.config.start_points, seed=self.config.completion.seed)
+        points, colors = start_points(
+            self.train_dataparser_outputs, count=self.config.start_points, seed=self.config.completion.seed
+        )
         if len(points):
             metadata = self.train_dataparser_outputs.metadata
             metadata |= {"points3D_xyz": points, "points3D_rgb": (colors * 255).round().to(torch.uint8)}
@@ -153,18 +173,26 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             completion = self.config.completion
             index = self._bank.drawn(step, seed=completion.seed, probability=self.generated_probability)
             if index is not None:
-                return self._bank.batch(index, as_float=self.config.cache_images_type == "float32", weight=completion.view_weight)
+                return self._bank.batch(
+                    index, as_float=self.config.cache_images_type == "float32", weight=completion.view_weight
+                )
         return self.next_captured(step)
 
     # ------------------------------------------------------------------------------------------------------ generation
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Checks before every iteration whether generated views are due and missing; refuses a broken model folder at once."""
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Checks before every iteration whether generated views are due and missing; refuses a broken model folder at
+        once.
+        """
         if self.config.completion.enabled and not self._finished:
             self._check_inpainter()
         if not self._finished and (brought := len(self._brought_frames)):
             CONSOLE.print(announcement_of_brought(brought, self.config.completion))
-        self.completion_panel.training_begins(takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views")
+        self.completion_panel.training_begins(
+            takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views"
+        )
         given = training_callback_attributes
         if given.trainer is not None and self.config.completion.enabled and not self._finished:
             self._say_if_it_ends_before(given.trainer)
@@ -181,7 +209,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         due, last = self.config.completion.at_step, trainer._start_step + trainer.config.max_num_iterations
         if due >= last:
             CONSOLE.print(
-                f"Views are generated before step {due} (completion.at_step), but this training ends with step {last - 1}: none will be "
+                f"Views are generated before step {due} (completion.at_step), but this training ends with step "
+                f"{last - 1}: none will be "
                 f"generated. Train longer, or set --pipeline.datamanager.completion.at-step below {last}."
             )
 
@@ -223,10 +252,14 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         views, added = self._fitted_in(views, attributes, scene.shell, cameras, step)
         self._set_bank(merged(bank, (), views))
         self._save_bank(attributes.trainer)
-        CONSOLE.print(f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen regions.")
+        CONSOLE.print(
+            f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen "
+            "regions."
+        )
 
     def _generate(self, attributes: TrainingCallbackAttributes, step: int) -> int | None:
-        """Generate the rounds that are due and missing; each is kept in the bank, in the run's folder and in a checkpoint at once.
+        """Generate the rounds that are due and missing; each is kept in the bank, in the run's folder and in a
+        checkpoint at once.
 
         Returns the step before which the next round is due, None where there is none.
         """
@@ -242,7 +275,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             plan = plan_inpainting(cameras, points, config, size=size)
         else:
             done, _ = without_requested(self.generated_views)
-            one = former_of(done, splats, self._rounds.number, trained=step >= TRAINED_STEPS) if in_turn(config) else None
+            one = (
+                former_of(done, splats, self._rounds.number, trained=step >= TRAINED_STEPS) if in_turn(config) else None
+            )
             plan = plan_completion(cameras, points, config, size=size, known=self.known_parts, former=one)
             if plan.covered is not None and step >= TRAINED_STEPS:
                 plan = needed_by_splats(plan, splats, cameras, self.known_parts)
@@ -252,7 +287,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             CONSOLE.print(announcement(plan, config, model))
         if plan.rounds:
             with refusing():
-                told = announcement_of_inpainting(plan, config, model) if inpaints else announcement(plan, config, model, done=done)
+                told = (
+                    announcement_of_inpainting(plan, config, model)
+                    if inpaints
+                    else announcement(plan, config, model, done=done)
+                )
             CONSOLE.print(told)
             if config.inpainter == "diffusion":
                 CONSOLE.print(f"The model's matrix products: {in_words(config.precision, self.device)}.")
@@ -262,7 +301,13 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                 if config.trust == "measured" and not inpaints and self._trust is None:
                     around = surroundings_of(plan.shell, splats, trained=step >= TRAINED_STEPS)
                     self._trust = measured_trust(
-                        [*context], model, config, size=size, cache=open_cache(config), on_step=bars.trial, surroundings=around
+                        [*context],
+                        model,
+                        config,
+                        size=size,
+                        cache=open_cache(config),
+                        on_step=bars.trial,
+                        surroundings=around,
                     )
                     CONSOLE.print(self._trust.in_words)
                     if self._trust.hidden:  # a kill in the first round costs that round, not the trial too
@@ -279,7 +324,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         new, other = self._to_fit_in(plan)
         if new is not None:
             new, added = self._fitted_in(new, attributes, plan.shell, cameras, step)
-            self._set_bank(new if other is None else CompletedViews.cat([*([other] if turns else []), new, *([] if turns else [other])]))
+            self._set_bank(
+                new
+                if other is None
+                else CompletedViews.cat([*([other] if turns else []), new, *([] if turns else [other])])
+            )
         due = None
         if turns:
             trains_until = None if trainer is None else trainer._start_step + trainer.config.max_num_iterations
@@ -289,11 +338,15 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             folder = self._save_bank(trainer)
             where = "" if folder is None else f", saved in {folder}"
             seconds = time.perf_counter() - started
-            CONSOLE.print(f"{len(new)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}.")
+            CONSOLE.print(
+                f"{len(new)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}."
+            )
         return due
 
     def _to_fit_in(self, plan: CompletionPlan) -> tuple[CompletedViews | None, CompletedViews | None]:
-        """The generated views that are new to the splats, and all others: of rounds in turn those of this plan, else all automatic ones."""
+        """The generated views that are new to the splats, and all others: of rounds in turn those of this plan, else
+        all automatic ones.
+        """
         done, requested = without_requested(self.generated_views)
         if done is None or not in_turn(self.config.completion):
             return done, requested
@@ -326,10 +379,19 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                 said = self._serve(request, attributes, step)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
-            _logger.warning("%s: not done: %s", type(request).__name__, error, exc_info=None if isinstance(error, ValueError) else error)
-            if asked is None and isinstance(request, RegenerateRound):  # it stays outdated, but is not tried before every iteration
+            _logger.warning(
+                "%s: not done: %s",
+                type(request).__name__,
+                error,
+                exc_info=None if isinstance(error, ValueError) else error,
+            )
+            if asked is None and isinstance(
+                request, RegenerateRound
+            ):  # it stays outdated, but is not tried before every iteration
                 self._given_up.add(request.number)
-                _logger.warning("Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number)
+                _logger.warning(
+                    "Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number
+                )
         release_memory()
         CONSOLE.print(said)
         self.completion_panel.report(said)
@@ -345,7 +407,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
 
     @contextmanager
     def _unchanged_on_error(self, attributes: TrainingCallbackAttributes) -> Iterator[None]:
-        """Bank, Gaussians and what is outdated are as they were where the block ends with an error, in the run's folder too."""
+        """Bank, Gaussians and what is outdated are as they were where the block ends with an error, in the run's folder
+        too.
+        """
         views, bank, outdated = self.generated_views, self._bank, list(self._outdated)
         try:
             with undone_on_error(splats_of(attributes), attributes.optimizers):
@@ -357,11 +421,15 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                     self.completion_panel.show(views)
                     self._save_bank(attributes.trainer)
                 except Exception:  # of drawing or of the disk: the checkpoint has the views
-                    _logger.warning("The run's folder or the viewer may show views that were given up again", exc_info=True)
+                    _logger.warning(
+                        "The run's folder or the viewer may show views that were given up again", exc_info=True
+                    )
             raise
 
     def _serve(self, request: Request, attributes: TrainingCallbackAttributes, step: int) -> str:
-        """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises ValueError."""
+        """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises
+        ValueError.
+        """
         if isinstance(request, RemoveView):
             said = self._remove(request, attributes)
         else:
@@ -383,10 +451,16 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         assert before is not None and place is not None  # without_view has raised otherwise
         gone = self._forget(before[[place]], after, self.captured_cameras(), attributes)
         self._set_bank(after)
-        return f"1 view removed, with {gone} Gaussians that no other view shows; {views_in_words(len(after or ()))} left."
+        return (
+            f"1 view removed, with {gone} Gaussians that no other view shows; {views_in_words(len(after or ()))} left."
+        )
 
     def _forget(
-        self, leaving: CompletedViews, staying: CompletedViews | None, cameras: list[Pinholes], attributes: TrainingCallbackAttributes
+        self,
+        leaving: CompletedViews,
+        staying: CompletedViews | None,
+        cameras: list[Pinholes],
+        attributes: TrainingCallbackAttributes,
     ) -> int:
         """Take away the Gaussians that only these views had a say in; returns how many."""
         splats = splats_of(attributes)
@@ -396,9 +470,14 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         return splats.remove_gaussians(gone, attributes.optimizers)
 
     def _generate_requested(
-        self, request: CompleteFrom | CompleteMissing | RegenerateRound, attributes: TrainingCallbackAttributes, step: int
+        self,
+        request: CompleteFrom | CompleteMissing | RegenerateRound,
+        attributes: TrainingCallbackAttributes,
+        step: int,
     ) -> str:
-        """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what was done."""
+        """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what
+        was done.
+        """
         started = time.perf_counter()
         config, splats = self.config.completion, splats_of(attributes)
         model, cameras = self._load_inpainter(), self.captured_cameras()
@@ -406,12 +485,16 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         if isinstance(request, CompleteMissing):
             points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
             whole, parts = self.generated_views, self.known_parts
-            planned = plan_missing(request, scene, whole, splats, cameras, points, config, parts, trained=step >= TRAINED_STEPS)
+            planned = plan_missing(
+                request, scene, whole, splats, cameras, points, config, parts, trained=step >= TRAINED_STEPS
+            )
         else:
             planned = plan_request(request, scene, self.generated_views, cameras, config, self.known_parts)
         context = [self.captured_view(index, cameras[index]) for index in planned.plan.context]
         with Bars(self.completion_panel, 1) as bars:
-            (new,) = run_completion(planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found)
+            (new,) = run_completion(
+                planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found
+            )
         del model
         release_memory()
         if self.generated_views is not None and planned.replaces:
@@ -419,7 +502,10 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         new, added = self._fitted_in(self._believed(new), attributes, scene.shell, cameras, step, holes_only=True)
         self._set_bank(merged(self.generated_views, planned.replaces, new))
         origin, seconds = new.origins[0], time.perf_counter() - started
-        said = f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed {origin.seed}, "
+        said = (
+            f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed "
+            f"{origin.seed}, "
+        )
         if isinstance(request, RegenerateRound):
             followers = [] if request.seed is None else standing_on(self.generated_views, request.number)
             self._outdated = sorted({*self._outdated, *followers} - {request.number})
@@ -442,12 +528,16 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         try:
             if self.config.completion.inpainter == "grid":
                 return GridInpainter.of(self.config.completion.inpainter_weights, self.device)
-            return LazyInpainter(self.config.completion.model, self.device, text_encoder=self.config.completion.text_encoder)
+            return LazyInpainter(
+                self.config.completion.model, self.device, text_encoder=self.config.completion.text_encoder
+            )
         except ValueError as error:
             raise Refused(str(error)) from None
 
     def _seen_points(self, splats: Any, cameras: list[Pinholes], step: int) -> torch.Tensor | None:
-        """Surface points: from structure from motion if the capture brings them, and from the splats once they are trained."""
+        """Surface points: from structure from motion if the capture brings them, and from the splats once they are
+        trained.
+        """
         known = self.train_dataparser_outputs.metadata.get("points3D_xyz")
         groups = [] if known is None else [known.cpu().float()]
         if step >= TRAINED_STEPS:
@@ -484,7 +574,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self.completion_panel.show(views)
 
     def _save_bank(self, trainer: Any) -> Path | None:
-        """Write the bank as a capture into the run's folder and return where; None without a trainer, and where something else stands."""
+        """Write the bank as a capture into the run's folder and return where; None without a trainer, and where
+        something else stands.
+        """
         if trainer is None:
             return None
         data = self.config.data or self.config.dataparser.data
@@ -520,7 +612,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self.captured_draws = int(state["captured_draws"])
         self._outdated = [int(number) for number in state.get("outdated", ())]
         self._trust = None if state.get("measured") is None else Trust.from_state(state["measured"])
-        if state.get("start_points") is not None:  # not triangulated again: interrupted rounds are planned from the very same points
+        if (
+            state.get("start_points") is not None
+        ):  # not triangulated again: interrupted rounds are planned from the very same points
             self._own_points = state["start_points"].cpu()
             self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points
         self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))

@@ -18,11 +18,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.files.faults import telling
 from fb_core.files.whole import swept, unfinished_beside, whole_file
-from fb_core.interruption import stop_on_signals
-from fb_nerfstudio.generation import refusing
-from fb_nerfstudio.going_on import check_capture, check_options_beside_a_file, check_shapes, checkpoint_of, parsed, read_checkpoint
+from fb_core.machine.interruption import stop_on_signals
+from fb_nerfstudio.checks.going_on import (
+    check_capture,
+    check_options_beside_a_file,
+    check_shapes,
+    checkpoint_of,
+    parsed,
+    read_checkpoint,
+)
+from fb_nerfstudio.checks.run_folder import claim_for, take_away
+from fb_nerfstudio.generation.surroundings import refusing
 from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
-from fb_nerfstudio.run_folder import claim_for, take_away
 
 
 @dataclass
@@ -35,14 +42,17 @@ class FillerbusterTrainerConfig(TrainerConfig):
     """Go on from a checkpoint although the capture is another than the one it was trained on."""
 
     def set_timestamp(self) -> None:
-        """Name the run. This is the first thing ``ns-train`` does with its options, so it is here that bad input is refused."""
+        """Name the run. This is the first thing ``ns-train`` does with its options, so it is here that bad input is
+        refused.
+        """
         stop_on_signals(self._stop)
         self.refuse_bad_input()
         with refusing(), refusing_what_cannot_be_written(self.output_dir):
             claim_for(self, checkpoint_of(self))
 
     def _stop(self, number: int) -> NoReturn:
-        """Ends the command with one line. A SystemExit: nerfstudio answers KeyboardInterrupt with a traceback and success.
+        """Ends the command with one line. A SystemExit: nerfstudio answers KeyboardInterrupt with a traceback and
+        success.
 
         A second signal ends it at once, whatever is still being cleaned up: files are whole or absent in any case.
         """
@@ -52,14 +62,20 @@ class FillerbusterTrainerConfig(TrainerConfig):
         if checkpoints is not None:
             advice = f"go on with --load-dir {checkpoints}"
         else:
-            advice = "nothing was saved yet" if self.load_checkpoint is None else f"go on with --load-checkpoint {self.load_checkpoint}"
+            advice = (
+                "nothing was saved yet"
+                if self.load_checkpoint is None
+                else f"go on with --load-checkpoint {self.load_checkpoint}"
+            )
         sys.stderr.write(f"\nStopped; {advice}.\n")
         raise SystemExit(128 + number)
 
     def refuse_bad_input(self) -> None:
-        """Raises Refused with one sentence for what cannot be trained on: devices, capture, model folder, checkpoint to go on from.
+        """Raises Refused with one sentence for what cannot be trained on: devices, capture, model folder, checkpoint to
+        go on from.
 
-        Where a run goes on from a checkpoint the model may be gone: it is needed only if generated views are still missing there.
+        Where a run goes on from a checkpoint the model may be gone: it is needed only if generated views are still
+        missing there.
         """
         datamanager: Any = self.pipeline.datamanager
         processes = self.machine.num_devices * self.machine.num_machines
@@ -94,7 +110,9 @@ class _AskedToStop(SystemExit):
 
 
 class FillerbusterTrainer(Trainer):
-    """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on, on a CPU to the same bits."""
+    """Saves checkpoints whole or not at all, so that a run that was killed at any moment can go on, on a CPU to the
+    same bits.
+    """
 
     config: FillerbusterTrainerConfig
     _in_step, _asked = False, 0
@@ -121,12 +139,17 @@ class FillerbusterTrainer(Trainer):
     def train(self) -> None:
         """As nerfstudio. A full disk ends the run with one sentence, whichever of its files could not be written.
 
-        Ctrl-C and SIGTERM end it after the step that is under way, with a checkpoint: no step is lost. While views are generated, or before
-        a step was made, they end it at once; what was trained before the generation, and every whole round, is saved by then.
+        Ctrl-C and SIGTERM end it after the step that is under way, with a checkpoint: no step is lost. While views are
+        generated, or before a step was made, they end it at once; what was trained before the generation, and every
+        whole round, is saved by then.
         """
         stop_on_signals(self._asked_to_stop)
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
-        self.callbacks = [TrainingCallback([before], self._step_begins), *self.callbacks, TrainingCallback([after], self._step_ends)]
+        self.callbacks = [
+            TrainingCallback([before], self._step_begins),
+            *self.callbacks,
+            TrainingCallback([after], self._step_ends),
+        ]
         with refusing_what_cannot_be_written(self.base_dir):
             try:
                 super().train()
@@ -154,18 +177,23 @@ class FillerbusterTrainer(Trainer):
             raise _AskedToStop(self._asked)
 
     def generation_begins(self) -> None:
-        """Called before views are generated, which may take long, or fail: what was trained is saved, or the training ends as asked."""
+        """Called before views are generated, which may take long, or fail: what was trained is saved, or the training
+        ends as asked.
+        """
         self._keep_what_is_trained()
         if self._asked:
             raise _AskedToStop(self._asked)
 
     def _keep_what_is_trained(self) -> None:
-        """Save the last whole step, if there is one that is not saved. Not to be called within a step that has changed anything."""
+        """Save the last whole step, if there is one that is not saved. Not to be called within a step that has changed
+        anything.
+        """
         if self._unsaved is not None:
             self.save_checkpoint(self._unsaved)
 
     def _load_checkpoint(self) -> None:
-        """As nerfstudio, once it is known that the file holds plain values: older versions of torch run code that is in it.
+        """As nerfstudio, once it is known that the file holds plain values: older versions of torch run code that is in
+        it.
 
         nerfstudio finds the latest by the names of whatever lies beside it, so it is told which file.
         """
@@ -183,7 +211,9 @@ class FillerbusterTrainer(Trainer):
             raise
         except (KeyError, RuntimeError) as error:
             told = " ".join(str(error).split())[:200]
-            raise Refused(f"checkpoint {path}: it does not fit the options ({told}); give those of its run, see its config.yml") from None
+            raise Refused(
+                f"checkpoint {path}: it does not fit the options ({told}); give those of its run, see its config.yml"
+            ) from None
         finally:
             config.load_checkpoint, config.load_dir = given, folder
         if path is not None:
@@ -195,7 +225,8 @@ class FillerbusterTrainer(Trainer):
         limit = model.config.max_gaussians
         if limit is not None and model.num_points > limit:
             CONSOLE.print(
-                f"The checkpoint has {model.num_points} Gaussians, more than --pipeline.model.max-gaussians {limit}: all of them stay, and "
+                f"The checkpoint has {model.num_points} Gaussians, more than --pipeline.model.max-gaussians {limit}: "
+                "all of them stay, and "
                 "none is added until pruning has left fewer."
             )
 
@@ -205,13 +236,17 @@ class FillerbusterTrainer(Trainer):
         super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> Any:
-        """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed run repeats them."""
+        """As nerfstudio. Backgrounds, splits and noise are drawn from the run's seed and the step alone, so a resumed
+        run repeats them.
+        """
         seed = np.random.SeedSequence([self.config.machine.seed, step]).generate_state(1, np.uint64)[0]
         torch.manual_seed(int(seed >> np.uint64(1)))
         return super().train_iteration(step)
 
     def save_checkpoint(self, step: int) -> None:
-        """As nerfstudio, but written beside the earlier checkpoints and then renamed; only then are the earlier ones removed."""
+        """As nerfstudio, but written beside the earlier checkpoints and then renamed; only then are the earlier ones
+        removed.
+        """
         folder = Path(self.checkpoint_dir)
         with refusing_what_cannot_be_written(self.base_dir), unfinished_beside(folder) as work:
             self.checkpoint_dir = work / "new"

@@ -1,7 +1,8 @@
-"""Generated views in nerfstudio's viewer: frustums with their pictures, a switch for each round, and what a person may ask for.
+"""Generated views in nerfstudio's viewer: frustums with their pictures, a switch for each round, and what a person may
+ask for.
 
 Everything here runs in the viewer's threads or draws for the training's: buttons only put requests into a queue
-(:mod:`fb_nerfstudio.requests`), which the training takes between two iterations.
+(:mod:`fb_core.completion.requests`), which the training takes between two iterations.
 """
 
 from __future__ import annotations
@@ -16,9 +17,7 @@ from jaxtyping import Float
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
-from fb_core.geometry.paths import distances
-from fb_nerfstudio.completed_views import CompletedViews, round_title
-from fb_nerfstudio.requests import (
+from fb_core.completion.requests import (
     MOST_VIEWS,
     CompleteFrom,
     CompleteMissing,
@@ -29,6 +28,8 @@ from fb_nerfstudio.requests import (
     key_of,
     place_of,
 )
+from fb_core.completion.results.completed_views import CompletedViews, round_title
+from fb_core.geometry.viewpoints.paths import distances
 from fb_nerfstudio.viewer_coverage import CoverageOverlay, picture_of
 
 if TYPE_CHECKING:
@@ -49,8 +50,9 @@ _PLAIN = "This run trains without new views: nothing will be generated on reques
 class CompletionPanel(ViewerControl):
     """The panel "Completion" and its frustums.
 
-    nerfstudio finds it as an attribute of the datamanager and calls ``_setup`` when there is a viewer: in ``ns-train`` before
-    a checkpoint is loaded, in ``ns-viewer`` after. So views may be given before or after; without a viewer nothing happens.
+    nerfstudio finds it as an attribute of the datamanager and calls ``_setup`` when there is a viewer: in ``ns-train``
+    before a checkpoint is loaded, in ``ns-viewer`` after. So views may be given before or after; without a viewer
+    nothing happens.
     """
 
     def __init__(self, *, prompt: str = "") -> None:
@@ -68,7 +70,9 @@ class CompletionPanel(ViewerControl):
         self._drawn: dict[str, tuple] = {}
         self._hidden: set[str] = set()
         self._rounds: dict[str, int] = {}
-        self._lock = threading.RLock()  # of all that is said, drawn and selected here: the training draws, clicks select
+        self._lock = (
+            threading.RLock()
+        )  # of all that is said, drawn and selected here: the training draws, clicks select
         self._selected: str | None = None
         self._marker: Any = None
         self.coverage = CoverageOverlay(self._draw)
@@ -132,7 +136,11 @@ class CompletionPanel(ViewerControl):
         if not self.is_open:
             return
         with self._lock:
-            rounds = {} if self.views is None else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
+            rounds = (
+                {}
+                if self.views is None
+                else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
+            )
             told = {name: (self.coverage.mode, *_told(views)) for name, views in rounds.items()}
             for name in [name for name in self._drawn if self._drawn[name] != told.get(name)]:
                 self._clear_round(name)
@@ -157,7 +165,10 @@ class CompletionPanel(ViewerControl):
     def _draw_round(self, name: str, views: CompletedViews) -> None:
         scene, node = self.viser_server.scene, f"{_NODE}/{name}"
         group = scene.add_frame(node, show_axes=False, visible=name not in self._hidden)  # hiding it hides all below it
-        self._groups[name] = [group, *(self._draw_view(f"{node}/view_{index:03d}", views, index) for index in range(len(views)))]
+        self._groups[name] = [
+            group,
+            *(self._draw_view(f"{node}/view_{index:03d}", views, index) for index in range(len(views))),
+        ]
 
         def show(visible: bool) -> None:
             with self._lock:
@@ -169,7 +180,10 @@ class CompletionPanel(ViewerControl):
     def _draw_view(self, node: str, views: CompletedViews, index: int) -> Any:
         camera = views.cameras[index]
         stride = max(1, -(-max(camera.width, camera.height) // _LARGEST_PICTURE))
-        color, picture = _COLORS[views.origins[index].round % len(_COLORS)], picture_of(views, index, self.coverage.mode, stride)
+        color, picture = (
+            _COLORS[views.origins[index].round % len(_COLORS)],
+            picture_of(views, index, self.coverage.mode, stride),
+        )
         handle, key = self._frustum(node, views, index, color=color, image=picture), key_of(views, index)
 
         @handle.on_click
@@ -190,7 +204,9 @@ class CompletionPanel(ViewerControl):
             fov=float(2 * np.arctan(camera.height / 2 / float(camera.focal[0, 1]))),
             aspect=camera.width / camera.height,
             scale=size * max(self.viewer.config.camera_frustum_scale, scale),
-            wxyz=transforms.SO3.from_matrix(camera.rotations[0].double().numpy()).wxyz,  # frustums have OpenCV axes, as ours
+            wxyz=transforms.SO3.from_matrix(
+                camera.rotations[0].double().numpy()
+            ).wxyz,  # frustums have OpenCV axes, as ours
             position=camera.centers[0].double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
             **look,
         )
@@ -233,14 +249,27 @@ class CompletionPanel(ViewerControl):
             return self._asking[name]
 
         add("prompt", "text", "Prompt", self._prompt, hint="What is to be seen, for models that read text.")
-        add("seed", "number", "Seed", 1, min=0, max=2**31 - 1, step=1, hint="Decides the pictures. It counts up by itself.")
+        add(
+            "seed",
+            "number",
+            "Seed",
+            1,
+            min=0,
+            max=2**31 - 1,
+            step=1,
+            hint="Decides the pictures. It counts up by itself.",
+        )
         hint = "The view from here and its neighbours to both sides."
         add("views", "number", "Views", 1, min=1, max=MOST_VIEWS, step=1, hint=hint)
-        add("complete", "button", "Complete from here", hint="Generate from where you stand.").on_click(self._complete_clicked)
+        add("complete", "button", "Complete from here", hint="Generate from where you stand.").on_click(
+            self._complete_clicked
+        )
         hint = "As many views as are set above, where they show most of what nobody has seen."
         add("missing", "button", "Complete what is missing", hint=hint).on_click(self._missing_clicked)
         add("round", "dropdown", "Round", (_NO_ROUND,), hint="Which views to generate anew.")
-        add("regenerate", "button", "Regenerate round", hint="The same cameras, another seed.").on_click(self._regenerate_clicked)
+        add("regenerate", "button", "Regenerate round", hint="The same cameras, another seed.").on_click(
+            self._regenerate_clicked
+        )
         add("look", "button", "Go to selected view", hint="Click a frustum to select it.").on_click(self._look_clicked)
         add("remove", "button", "Remove this view", hint="Click a frustum to select it.").on_click(self._remove_clicked)
 
@@ -321,7 +350,9 @@ class CompletionPanel(ViewerControl):
             if self.views is not None and place is not None:
                 self._marker = self._frustum(f"{_NODE}/selected", self.views, place, size=1.1, color=_SELECTED_COLOR)
                 origin = self.views.origins[place]
-                said = f"Selected: {round_title(origin.role, origin.round)}, seed {origin.seed}, trust {origin.trust:.2f}"
+                said = (
+                    f"Selected: {round_title(origin.role, origin.round)}, seed {origin.seed}, trust {origin.trust:.2f}"
+                )
                 self._message = f'{said}, prompt "{origin.prompt}"' if origin.prompt else said
             self._write_status()
 
@@ -346,7 +377,9 @@ def spacing(views: CompletedViews) -> float:
     centers = views.cameras.centers.double().cpu()
     if len(centers) < 2:
         return 0.0
-    return float((distances(centers, centers) + torch.diag(torch.full((len(centers),), torch.inf))).min(dim=1).values.median())
+    return float(
+        (distances(centers, centers) + torch.diag(torch.full((len(centers),), torch.inf))).min(dim=1).values.median()
+    )
 
 
 def _label(views: CompletedViews) -> str:

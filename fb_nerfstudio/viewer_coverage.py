@@ -1,6 +1,8 @@
-"""What the viewer shows of coverage and trust: what nobody has seen, cameras before their views are there, and how far pixels are believed.
+"""What the viewer shows of coverage and trust: what nobody has seen, cameras before their views are there, and how far
+pixels are believed.
 
-Draws beside the frustums of :mod:`fb_nerfstudio.viewer`, into the same panel; like these it only draws and never asks the training.
+Draws beside the frustums of :mod:`fb_nerfstudio.viewer`, into the same panel; like these it only draws and never asks
+the training.
 """
 
 from __future__ import annotations
@@ -13,13 +15,15 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from fb_nerfstudio.completed_views import CompletedViews
+from fb_core.completion.results.completed_views import CompletedViews
 
 if TYPE_CHECKING:
-    from fb_nerfstudio.completion_plan import CompletionPlan
+    from fb_core.completion.planning.plan import CompletionPlan
 
 Pictures = Literal["generated", "trust", "trained on"]
-"""What frustums show: the pictures, these tinted by the trust of each pixel, or these dark where the splats are not trained on them."""
+"""What frustums show: the pictures, these tinted by the trust of each pixel, or these dark where the splats are not
+trained on them.
+"""
 _NODE = "/completion"
 _UNSEEN_COLOR, _PLANNED_COLOR = (255, 90, 40), (235, 235, 235)
 _DOUBTED, _BELIEVED = (255, 120, 0), (40, 120, 255)  # told apart by people who do not tell red from green
@@ -40,7 +44,9 @@ def picture_of(views: CompletedViews, index: int, mode: Pictures, stride: int = 
 
 
 class CoverageOverlay:
-    """Unseen parts of the surroundings as coloured points, planned cameras as empty frustums, and the choice of what pictures show."""
+    """Unseen parts of the surroundings as coloured points, planned cameras as empty frustums, and the choice of what
+    pictures show.
+    """
 
     def __init__(self, redraw: Callable[[], None]) -> None:
         """``redraw`` draws all frustums anew, once the pictures are to show something else."""
@@ -58,7 +64,9 @@ class CoverageOverlay:
         self._lock = threading.RLock()  # the training plans, clicks switch
 
     def setup(self, server: Any, folder: Any, *, order: float) -> None:
-        """There is a viewer, and the panel's folder, where fields appear once there is something to choose; draws what is known."""
+        """There is a viewer, and the panel's folder, where fields appear once there is something to choose; draws what
+        is known.
+        """
         self._server, self._folder, self._order = server, folder, order
         self._points, self._planned, self._switch, self._choice = None, [], None, None
         self._draw()
@@ -68,7 +76,9 @@ class CoverageOverlay:
         if self._server is None or self._choice is not None:
             return
         with self._folder:
-            self._choice = choice = self._server.gui.add_dropdown("Pictures show", get_args(Pictures), order=self._order + 0.1)
+            self._choice = choice = self._server.gui.add_dropdown(
+                "Pictures show", get_args(Pictures), order=self._order + 0.1
+            )
 
         @choice.on_update
         def _(_: Any) -> None:
@@ -79,7 +89,9 @@ class CoverageOverlay:
         if self._switch is not None:
             return
         with self._folder:
-            self._switch = switch = self._server.gui.add_checkbox("What nobody has seen", initial_value=self._visible, order=self._order)
+            self._switch = switch = self._server.gui.add_checkbox(
+                "What nobody has seen", initial_value=self._visible, order=self._order
+            )
 
         @switch.on_update
         def _(_: Any) -> None:
@@ -126,12 +138,19 @@ class CoverageOverlay:
             points = coverage.surface[~coverage.seen].cpu().float().numpy() * RATIO
             colors = np.tile(np.array(_UNSEEN_COLOR, dtype=np.uint8), (len(points), 1))
             self._points = self._server.scene.add_point_cloud(
-                f"{_NODE}/unseen", points, colors, point_size=_POINT_SHARE * size * RATIO, point_shape="circle", visible=self._visible
+                f"{_NODE}/unseen",
+                points,
+                colors,
+                point_size=_POINT_SHARE * size * RATIO,
+                point_shape="circle",
+                visible=self._visible,
             )
         for one in self.plan.rounds:
             for index in range(len(one.cameras)):
                 node = f"{_NODE}/planned/{one.number:02d}_{index:03d}"
-                self._planned.append(self._frustum(node, one.cameras[index], size=_FRUSTUM_SHARE * max(shape.radius, 0.1 * size)))
+                self._planned.append(
+                    self._frustum(node, one.cameras[index], size=_FRUSTUM_SHARE * max(shape.radius, 0.1 * size))
+                )
 
     def _frustum(self, node: str, camera: Any, *, size: float) -> Any:
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO as RATIO

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 
-from fb_core.interruption import ENDED_BY_USER, stop_on_signals
+from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
 
 DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
 """Environment variable that, set to anything, shows the traceback of an error."""
@@ -19,7 +19,7 @@ def main() -> None:
     """Runs the command that the command line asks for."""
     stop_on_signals()
     try:
-        from method_configs import commands
+        from method_configs.commands import command_line as commands
 
         commands.main()
     except KeyboardInterrupt:

@@ -1,4 +1,6 @@
-"""What this machine lacks: one sentence for each thing, and the one of them that can be mended from here (OpenCV's build)."""
+"""What this machine lacks: one sentence for each thing, and the one of them that can be mended from here (OpenCV's
+build).
+"""
 
 from __future__ import annotations
 
@@ -30,19 +32,25 @@ class Lack:
 
 
 def lacks() -> list[Lack]:
-    """Everything that is missing on this machine; empty when all commands of this project and of nerfstudio can work."""
+    """Everything that is missing on this machine; empty when all commands of this project and of nerfstudio can
+    work.
+    """
     found = [_opencv(), _ffmpeg(), _libusb(), _compiler(), _cuda_toolkit()]
     return [lack for lack in found if lack is not None]
 
 
 def has_contrib() -> bool:
-    """Whether ``import cv2`` gives the contrib build, asked in a fresh interpreter because a module is imported only once."""
+    """Whether ``import cv2`` gives the contrib build, asked in a fresh interpreter because a module is imported only
+    once.
+    """
     question = "import cv2; cv2.ximgproc.thinning; cv2.xphoto.inpaint"
     return subprocess.run([sys.executable, "-c", question], capture_output=True).returncode == 0
 
 
 def mend_opencv() -> None:
-    """Install the contrib build once more, so that its files win over the plain build's. Raises ValueError when that does not help."""
+    """Install the contrib build once more, so that its files win over the plain build's. Raises ValueError when that
+    does not help.
+    """
     try:
         requirement = f"{CONTRIB}=={importlib.metadata.version(CONTRIB)}"
     except importlib.metadata.PackageNotFoundError as error:
@@ -59,7 +67,8 @@ def _opencv() -> Lack | None:
     command = f"{Path(sys.executable).name} -m pip install --force-reinstall --no-deps {CONTRIB}==4.10.0.84"
     return Lack(
         name="OpenCV's contrib modules",
-        sentence=f"OpenCV's contrib modules are missing because the plain build was installed over them; run: {command}",
+        sentence="OpenCV's contrib modules are missing because the plain build was installed over them; run: "
+        f"{command}",
         mendable=True,
     )
 
@@ -68,7 +77,9 @@ def _ffmpeg() -> Lack | None:
     if shutil.which("ffmpeg"):
         return None
     return Lack(
-        name="ffmpeg", sentence="ffmpeg was not found, which ns-render needs even for single images; install the system package ffmpeg."
+        name="ffmpeg",
+        sentence="ffmpeg was not found, which ns-render needs even for single images; install the system package "
+        "ffmpeg.",
     )
 
 
@@ -94,7 +105,9 @@ def _cuda_toolkit() -> Lack | None:
 
 
 def check(*, mend: bool = False) -> list[Lack]:
-    """Log one sentence for everything that is missing, after mending what can be mended if ``mend``; returns what is left."""
+    """Log one sentence for everything that is missing, after mending what can be mended if ``mend``; returns what is
+    left.
+    """
     if mend and not has_contrib():
         mend_opencv()
     left = lacks()
@@ -106,7 +119,9 @@ def check(*, mend: bool = False) -> list[Lack]:
 
 
 def main() -> None:
-    """``python -m method_configs.environment [--mend]``: exits with 1 when something is missing that stops this project's own work."""
+    """``python -m method_configs.environment [--mend]``: exits with 1 when something is missing that stops this
+    project's own work.
+    """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         left = check(mend="--mend" in sys.argv[1:])

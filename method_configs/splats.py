@@ -17,11 +17,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from fb_nerfstudio.completion_config import CompletionConfig
+from fb_core.completion.options import CompletionConfig
 from fb_nerfstudio.datamanager import FillerbusterDataManagerConfig
-from fb_nerfstudio.fused_adam import FusedAdamOptimizerConfig
-from fb_nerfstudio.schedulers import FloatExponentialDecaySchedulerConfig
-from fb_nerfstudio.splat_model import FillerbusterSplatModelConfig
+from fb_nerfstudio.splats.fused_adam import FusedAdamOptimizerConfig
+from fb_nerfstudio.splats.schedulers import FloatExponentialDecaySchedulerConfig
+from fb_nerfstudio.splats.splat_model import FillerbusterSplatModelConfig
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 
 _ON_GPU = torch.cuda.is_available()
@@ -29,10 +29,11 @@ _ITERATIONS = 30000 if _ON_GPU else 3000
 
 
 def _model() -> FillerbusterSplatModelConfig:
-    """Splatfacto's defaults and a cap; without a GPU fewer Gaussians, simpler colours and a schedule of a tenth of the length.
+    """Splatfacto's defaults and a cap; without a GPU fewer Gaussians, simpler colours and a schedule of a tenth of the
+    length.
 
-    Normals are regularised from 10000 of 30000 steps on; in the short schedule from where Gaussians have ceased to split, since a tenth
-    of that would meet geometry that has hardly begun to settle.
+    Normals are regularised from 10000 of 30000 steps on; in the short schedule from where Gaussians have ceased to
+    split, since a tenth of that would meet geometry that has hardly begun to settle.
     """
     if _ON_GPU:
         return FillerbusterSplatModelConfig(max_gaussians=1_000_000)
@@ -55,7 +56,9 @@ def _optimizers() -> dict[str, Any]:
         return {"optimizer": FusedAdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": scheduler}
 
     def decay(lr_final: float, warmup_steps: int = 0) -> FloatExponentialDecaySchedulerConfig:
-        return FloatExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=_ITERATIONS, warmup_steps=warmup_steps, lr_pre_warmup=0.0)
+        return FloatExponentialDecaySchedulerConfig(
+            lr_final=lr_final, max_steps=_ITERATIONS, warmup_steps=warmup_steps, lr_pre_warmup=0.0
+        )
 
     return {
         "means": adam(1.6e-4, decay(1.6e-6)),
@@ -83,7 +86,8 @@ def _trainer() -> TrainerConfig:
             datamanager=FillerbusterDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
-                # Splats of some hundred steps tell what is seen better than the cameras alone; captured views stay in the majority.
+                # Splats of some hundred steps tell what is seen better than the cameras alone; captured views stay in
+                # the majority.
                 completion=CompletionConfig(at_step=500, generated_share=0.3, trust="measured"),
             ),
             model=_model(),
@@ -112,8 +116,8 @@ def without_completion(config: TrainerConfig, method_name: str) -> TrainerConfig
 def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> TrainerConfig:
     """A copy under another name that is optimised as the authors did (paper, section 3.2 and their released options).
 
-    Gaussians start at random in a cube and have no harmonics; the loss is L1 alone; generated views are there from the first step, are
-    trained on wholly and take half of the steps; nothing of ours mends them.
+    Gaussians start at random in a cube and have no harmonics; the loss is L1 alone; generated views are there from the
+    first step, are trained on wholly and take half of the steps; nothing of ours mends them.
     """
     other = with_completion(
         config,
@@ -132,14 +136,21 @@ def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> Traine
     datamanager.start_points = 0
     datamanager.dataparser.load_3D_points = False
     steps = {"stop_screen_size_at": _ITERATIONS, "stop_split_at": _ITERATIONS}
-    chosen = {"random_init": True, "sh_degree": 0, "ssim_lambda": 0.0, "num_downscales": 0, "use_scale_regularization": True}
+    chosen = {
+        "random_init": True,
+        "sh_degree": 0,
+        "ssim_lambda": 0.0,
+        "num_downscales": 0,
+        "use_scale_regularization": True,
+    }
     other.pipeline.model = dataclasses.replace(model, **chosen, **steps)
     return other
 
 
 fillerbuster = MethodSpecification(
     config=_trainer(),
-    description="Complete a casual capture with multi-view diffusion, then train Gaussian splats on captured and generated views.",
+    description="Complete a casual capture with multi-view diffusion, then train Gaussian splats on captured and "
+    "generated views.",
 )
 fillerbuster_none = MethodSpecification(
     config=without_completion(fillerbuster.config, "fillerbuster-none"),
@@ -147,20 +158,31 @@ fillerbuster_none = MethodSpecification(
 )
 fillerbuster_paper = MethodSpecification(
     config=optimized_as_in_the_paper(fillerbuster.config, "fillerbuster-paper"),
-    description="Complete a casual capture and optimise as the paper's authors did: random start, no harmonics, L1 alone.",
+    description="Complete a casual capture and optimise as the paper's authors did: random start, no harmonics, L1 "
+    "alone.",
 )
 fillerbuster_cat3d_size = MethodSpecification(
     # No anchors: CAT3D's model has no room for them beside its conditioning.
     config=with_completion(
-        fillerbuster.config, "fillerbuster-cat3d-size", context_views=3, anchor_views=0, densify_rounds=20, densify_views=6, trust="full"
+        fillerbuster.config,
+        "fillerbuster-cat3d-size",
+        context_views=3,
+        anchor_views=0,
+        densify_rounds=20,
+        densify_views=6,
+        trust="full",
     ),
     description="The paper's baseline with CAT3D's sequence size: 3 conditioning views, 20 rounds of 6 new ones.",
 )
 fillerbuster_masked = MethodSpecification(
-    config=with_completion(fillerbuster.config, "fillerbuster-masked", task="inpaint", at_step=0, seed_gaussians=False, trust="full"),
-    description="Inpaint what masks leave unknown in 32 captured views, together and once, then train splats (NeRFiller's protocol).",
+    config=with_completion(
+        fillerbuster.config, "fillerbuster-masked", task="inpaint", at_step=0, seed_gaussians=False, trust="full"
+    ),
+    description="Inpaint what masks leave unknown in 32 captured views, together and once, then train splats "
+    "(NeRFiller's protocol).",
 )
 nerfiller_grid = MethodSpecification(
     config=with_completion(fillerbuster_masked.config, "nerfiller-grid", inpainter="grid"),
-    description="fillerbuster-masked with a 2D inpainter on 2x2 grids of views: diffusers' from a folder, or OpenCV's without weights.",
+    description="fillerbuster-masked with a 2D inpainter on 2x2 grids of views: diffusers' from a folder, or OpenCV's "
+    "without weights.",
 )

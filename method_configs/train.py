@@ -1,4 +1,5 @@
-"""``python -m method_configs.train``: `fillerbuster train` for machines with torch, einops, jaxtyping and safetensors only.
+"""``python -m method_configs.train``: `fillerbuster train` for machines with torch, einops, jaxtyping and safetensors
+only.
 
 torchrun starts this module too. Its options are those of `train_preset`, read from its signature.
 """
@@ -15,9 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fb_core.files.faults import sentence_of
-from fb_core.interruption import ENDED_BY_USER, stop_on_signals
-from fb_core.training.distributed import left_at_once
-from method_configs.training_command import train_preset
+from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
+from fb_core.training.run.distributed import left_at_once
+from method_configs.commands.training import train_preset
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -46,8 +47,12 @@ def parser() -> argparse.ArgumentParser:
         elif types[name] is bool:
             options.add_argument(flag, action=argparse.BooleanOptionalAction, default=parameter.default)
         else:
-            kind = next(kind for kind in (Path, int, float, str) if kind is types[name] or kind in typing.get_args(types[name]))
-            options.add_argument(flag, type=kind, required=parameter.default is parameter.empty, default=parameter.default)
+            kind = next(
+                kind for kind in (Path, int, float, str) if kind is types[name] or kind in typing.get_args(types[name])
+            )
+            options.add_argument(
+                flag, type=kind, required=parameter.default is parameter.empty, default=parameter.default
+            )
     return options
 
 

@@ -62,8 +62,10 @@ def _same_random_numbers() -> None:
 
 @pytest.fixture(scope="session")
 def _tiny_capture_original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six 48x32 views on a ring of radius 2 that look at a smooth pattern, every second one with a mask, and 50 points."""
-    from fb_core.data.captures import FrameToWrite, Points, write_capture
+    """Six 48x32 views on a ring of radius 2 that look at a smooth pattern, every second one with a mask, and 50
+    points.
+    """
+    from fb_core.data.capture.captures import FrameToWrite, Points, write_capture
     from fb_core.geometry.cameras import Pinholes
 
     angles = torch.arange(6, dtype=torch.float64) * torch.pi / 3
@@ -76,7 +78,9 @@ def _tiny_capture_original(tmp_path_factory: pytest.TempPathFactory) -> Path:
         image = (0.5 + 0.5 * torch.sin(3 * directions + torch.arange(3)[:, None, None])).float()
         mask = torch.ones(1, 32, 48)
         mask[:, 8:16, 10:30] = 0.0
-        frames.append(FrameToWrite(name=f"view_{index:03d}", image=image, mask=mask if index % 2 else None, camera=cameras[index]))
+        frames.append(
+            FrameToWrite(name=f"view_{index:03d}", image=image, mask=mask if index % 2 else None, camera=cameras[index])
+        )
     generator = torch.Generator().manual_seed(0)
     points = Points(positions=torch.randn(50, 3, generator=generator), colors=torch.rand(50, 3, generator=generator))
     return write_capture(tmp_path_factory.mktemp("tiny") / "capture", frames, points=points).root

@@ -1,4 +1,6 @@
-"""The run-time type checker of the tests: beartype, with an int accepted where a float is asked for (as in Python's typing rules)."""
+"""The run-time type checker of the tests: beartype, with an int accepted where a float is asked for (as in Python's
+typing rules).
+"""
 
 from beartype import BeartypeConf, beartype
 

@@ -14,21 +14,38 @@ PACKAGES = ("fb_core", "fb_nerfstudio", "method_configs")
 # From left to right: a module may import its own floor and the floors before it.
 FLOORS = (
     (
-        *("fb_core.files", "fb_core.machine", "fb_core.limits", "fb_core.json_files", "fb_core.interruption"),
+        *(
+            "fb_core.files",
+            "fb_core.machine",
+            "fb_core.files.limits",
+            "fb_core.files.json_files",
+            "fb_core.machine.interruption",
+        ),
         *("fb_core.geometry", "fb_core.networks", "fb_core.masks"),
     ),
-    ("fb_core.views", "fb_core.conditioning", "fb_core.flow", "fb_core.sampler", "fb_core.sampling"),
-    ("fb_core.inpainter", "fb_core.checkpoint", "fb_core.memory", "fb_core.live_bytes"),
+    ("fb_core.views", "fb_core.conditioning", "fb_core.flow", "fb_core.sampling", "fb_core.sampling"),
+    ("fb_core.inpainter", "fb_core.checkpoint", "fb_core.memory", "fb_core.memory.live_bytes"),
     (
         *("fb_core.data", "fb_core.training", "fb_core.evaluation"),
-        *("fb_core.registration", "fb_core.model_registration", "fb_core.feature_registration"),
-        *("fb_core.fly_through", "fb_core.duration"),
+        *("fb_core.registration", "fb_core.registration.by_raymaps", "fb_core.registration.by_features"),
+        *("fb_core.completion.fly_through", "fb_core.completion.duration"),
     ),
     ("fb_nerfstudio",),
     ("method_configs",),
 )
 NEVER_IN_CORE = {"nerfstudio", "gsplat", "viser"}
-HEAVY = {"kornia", "cv2", "trimesh", "pyvista", "OpenImageIO", "matplotlib", "transformers", "diffusers", "open3d", "torchvision"}
+HEAVY = {
+    "kornia",
+    "cv2",
+    "trimesh",
+    "pyvista",
+    "OpenImageIO",
+    "matplotlib",
+    "transformers",
+    "diffusers",
+    "open3d",
+    "torchvision",
+}
 CORE_NEEDS = {"torch", "numpy", "einops", "safetensors", "jaxtyping"}
 CORE = (*FLOORS[0], *FLOORS[1], *FLOORS[2], "fb_core.training")
 
@@ -60,13 +77,16 @@ def is_type_checking(node: ast.AST) -> bool:
 
 
 def imports_of(tree: ast.AST, module: str, is_package: bool) -> list[Import]:
-    """All imports with what runs when the module is imported told from what waits in functions (or in TYPE_CHECKING)."""
+    """All imports with what runs when the module is imported told from what waits in functions (or in
+    TYPE_CHECKING).
+    """
     found: list[Import] = []
 
     def walk(node: ast.AST, at_import_time: bool) -> None:
         if isinstance(node, ast.Import):
             found.extend(
-                Import(importer=module, imported=name.name, line=node.lineno, at_import_time=at_import_time) for name in node.names
+                Import(importer=module, imported=name.name, line=node.lineno, at_import_time=at_import_time)
+                for name in node.names
             )
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
@@ -77,8 +97,14 @@ def imports_of(tree: ast.AST, module: str, is_package: bool) -> list[Import]:
                 full = f"{base}.{name.name}"
                 place = REPOSITORY / full.replace(".", "/")
                 imported = full if place.is_dir() or place.with_suffix(".py").is_file() else base
-                found.append(Import(importer=module, imported=imported, line=node.lineno, at_import_time=at_import_time))
-        inside = at_import_time and not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)) and not is_type_checking(node)
+                found.append(
+                    Import(importer=module, imported=imported, line=node.lineno, at_import_time=at_import_time)
+                )
+        inside = (
+            at_import_time
+            and not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            and not is_type_checking(node)
+        )
         for child in ast.iter_child_nodes(node):
             walk(child, inside)
 
@@ -88,7 +114,11 @@ def imports_of(tree: ast.AST, module: str, is_package: bool) -> list[Import]:
 
 def all_imports() -> list[Import]:
     files = [path for package in PACKAGES for path in sorted((REPOSITORY / package).rglob("*.py"))]
-    return [one for path in files for one in imports_of(ast.parse(path.read_text()), module_name(path), path.name == "__init__.py")]
+    return [
+        one
+        for path in files
+        for one in imports_of(ast.parse(path.read_text()), module_name(path), path.name == "__init__.py")
+    ]
 
 
 IMPORTS = all_imports()
@@ -123,23 +153,33 @@ def test_the_package_itself_imports_none_of_its_rooms() -> None:
 
 
 def test_core_never_knows_nerfstudio() -> None:
-    faults = [one for one in IMPORTS if is_within(one.importer, "fb_core") and one.imported.split(".")[0] in NEVER_IN_CORE]
+    faults = [
+        one for one in IMPORTS if is_within(one.importer, "fb_core") and one.imported.split(".")[0] in NEVER_IN_CORE
+    ]
     assert not faults, told(faults)
 
 
 def test_sampling_and_training_need_little() -> None:
-    """Only torch, numpy, einops, safetensors and jaxtyping when imported; heavier things wait in the functions that own the job."""
+    """Only torch, numpy, einops, safetensors and jaxtyping when imported; heavier things wait in the functions that own
+    the job.
+    """
     allowed = CORE_NEEDS | set(sys.stdlib_module_names) | {"fb_core"}
     faults = [
         one
         for one in IMPORTS
-        if one.at_import_time and any(is_within(one.importer, room) for room in CORE) and one.imported.split(".")[0] not in allowed
+        if one.at_import_time
+        and any(is_within(one.importer, room) for room in CORE)
+        and one.imported.split(".")[0] not in allowed
     ]
     assert not faults, told(faults)
 
 
 def test_heavy_libraries_wait_until_they_are_needed() -> None:
-    faults = [one for one in IMPORTS if one.at_import_time and one.imported.split(".")[0] in HEAVY and is_within(one.importer, "fb_core")]
+    faults = [
+        one
+        for one in IMPORTS
+        if one.at_import_time and one.imported.split(".")[0] in HEAVY and is_within(one.importer, "fb_core")
+    ]
     assert not faults, told(faults)
 
 

@@ -1,4 +1,6 @@
-"""Every command in the README and the guides is one that its parser accepts, with files that exist where files are named."""
+"""Every command in the README and the guides is one that its parser accepts, with files that exist where files are
+named.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from method_configs import commands
+from method_configs.commands import command_line as commands
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ["README.md", "docs/quickstart.md", "docs/gpu.md", "docs/training.md", "docs/weights.md", "docs/speed_and_accuracy.md"]
+PAGES = [
+    "README.md",
+    "docs/quickstart.md",
+    "docs/gpu.md",
+    "docs/training.md",
+    "docs/weights.md",
+    "docs/speed_and_accuracy.md",
+]
 
 
 def commands_of(page: str) -> list[str]:
@@ -27,7 +36,17 @@ ALL = [(page, line) for page in PAGES for line in commands_of(page)]
 
 def test_the_pages_have_commands():
     programs = {shlex.split(line)[0] for _, line in ALL}
-    assert {"make", "fillerbuster", "ns-train", "ns-viewer", "ns-eval", "ns-render", "ns-export", "python", "torchrun"} == programs
+    assert {
+        "make",
+        "fillerbuster",
+        "ns-train",
+        "ns-viewer",
+        "ns-eval",
+        "ns-render",
+        "ns-export",
+        "python",
+        "torchrun",
+    } == programs
 
 
 @pytest.mark.parametrize(("page", "line"), [one for one in ALL if one[1].startswith("make ")])
@@ -38,7 +57,9 @@ def test_make_has_the_target(page, line):
 
 @pytest.mark.parametrize(("page", "line"), [one for one in ALL if one[1].startswith("fillerbuster ")])
 def test_fillerbuster_accepts(page, line, monkeypatch):
-    """The command's own parser calls the subcommand, which is recorded instead of run (test_commands runs each in miniature)."""
+    """The command's own parser calls the subcommand, which is recorded instead of run (test_commands runs each in
+    miniature).
+    """
     called = []
     for name, function in commands.COMMANDS.items():
         recorder = functools.wraps(function)(lambda *args, _name=name, **options: called.append(_name))
@@ -50,7 +71,7 @@ def test_fillerbuster_accepts(page, line, monkeypatch):
 
 @pytest.mark.parametrize(("page", "line"), [one for one in ALL if "-m method_configs.train " in one[1]])
 def test_the_entrance_without_tyro_accepts(page, line):
-    from method_configs.ablations import PRESETS
+    from method_configs.presets import PRESETS
     from method_configs.train import parser
 
     launcher, _, arguments = line.partition("-m method_configs.train ")
@@ -100,7 +121,9 @@ def test_options_of_the_table_exist():
     """The README's table of options names real fields with their real defaults."""
     from method_configs.splats import fillerbuster
 
-    rows = re.findall(r"^\| `--([a-z.-]+)` \| ([^|]+) \|", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    rows = re.findall(
+        r"^\| `--([a-z.-]+)` \| ([^|]+) \|", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     assert len(rows) >= 8
     for option, default in rows:
         value = fillerbuster.config

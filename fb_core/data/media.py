@@ -1,10 +1,11 @@
 """Still images in and out: files on one side, float tensors (3 h w, range [0, 1]) on the other.
 
 OpenImageIO does the decoding and is imported on first use. Orientation tags of phones (EXIF) are honoured. Every reader
-raises ``ValueError`` with one sentence for a file that is missing, empty, cut short, or not an image, whatever its decoder raises.
+raises ``ValueError`` with one sentence for a file that is missing, empty, cut short, or not an image, whatever its
+decoder raises.
 
-A picture is what its file means to show: the display window of an EXR file (pixels outside of its data window are unknown), colours that
-are not multiplied by alpha.
+A picture is what its file means to show: the display window of an EXR file (pixels outside of its data window are
+unknown), colours that are not multiplied by alpha.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from fb_core.data.picture_decoders import (
     told,
     upright,
 )
+from fb_core.files.limits import require_decodable
 from fb_core.files.whole import by_way_of_memory
-from fb_core.limits import require_decodable
 
 HEIF_SUFFIXES = (".heic", ".heif")
 _ONE_OF_255 = 1 / 255 + 1e-6
@@ -78,10 +79,13 @@ def read_image_with_alpha(
         return repeat(pixels[colours[0]], "h w -> channels h w", channels=3), alpha
 
 
-def read_photo(path: str | Path, *, apply_orientation: bool = True) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"] | None]:
+def read_photo(
+    path: str | Path, *, apply_orientation: bool = True
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"] | None]:
     """Like :func:`read_image_with_alpha`, as the picture is looked at: sRGB in [0, 1], whatever the file.
 
-    Colours of EXR files, which are linear and multiplied by alpha, are converted; their pixels that are not finite are transparent.
+    Colours of EXR files, which are linear and multiplied by alpha, are converted; their pixels that are not finite are
+    transparent.
     """
     image, alpha = read_image_with_alpha(path, apply_orientation=apply_orientation)
     if Path(path).suffix.lower() == ".exr":
@@ -133,16 +137,21 @@ def image_size(path: str | Path, *, apply_orientation: bool = True) -> tuple[int
 
 
 def posed_size(path: str | Path) -> tuple[int, int]:
-    """(height, width) of a posed picture as nerfstudio counts: stored pixels, but TIFF files upright, for Pillow turns these alone."""
+    """(height, width) of a posed picture as nerfstudio counts: stored pixels, but TIFF files upright, for Pillow turns
+    these alone.
+    """
     return image_size(path, apply_orientation=Path(path).suffix.lower() in TIFF_SUFFIXES)
 
 
 def fits_only_upright(path: str | Path, size: tuple[int, int], *, smaller_by: float = 1) -> bool:
-    """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in stored pixels, unless
-    only the upright size fits; TIFF files the other way round. Headers alone are read. ``smaller_by``: the size is that of a copy, by this
-    factor smaller than the file."""
+    """Whether a posed picture of (height, width) must be turned as its EXIF tag says: such pictures are counted in
+    stored pixels, unless only the upright size fits; TIFF files the other way round. Headers alone are read.
+    ``smaller_by``: the size is that of a copy, by this factor smaller than the file.
+    """
     sizes = (image_size(path, apply_orientation=turned) for turned in (False, True))
-    as_stored, as_upright = ((int(height // smaller_by), int(width // smaller_by)) == tuple(size) for height, width in sizes)
+    as_stored, as_upright = (
+        (int(height // smaller_by), int(width // smaller_by)) == tuple(size) for height, width in sizes
+    )
     if Path(path).suffix.lower() in TIFF_SUFFIXES:
         return as_upright or not as_stored
     return as_upright and not as_stored
@@ -155,7 +164,9 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
     """
     path = Path(path)
     if image.shape[0] not in (1, 3) or image.shape[1] == 0 or image.shape[2] == 0:
-        raise ValueError(f"write_image {path}: expected an image of shape (3 or 1, height, width), got {tuple(image.shape)}")
+        raise ValueError(
+            f"write_image {path}: expected an image of shape (3 or 1, height, width), got {tuple(image.shape)}"
+        )
     if bits not in (8, 16):
         raise ValueError(f"write_image {path}: expected bits 8 or 16, got {bits}")
     if path.suffix.lower() == ".exr":
@@ -163,10 +174,17 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
         write_exr(path, {name: image[index] for index, name in enumerate(names)})
         return
     if not bool(torch.isfinite(image).all()):
-        raise ValueError(f"write_image {path}: the image holds NaN or infinity, expected values in [0, 1]; write an .exr to keep them")
+        raise ValueError(
+            f"write_image {path}: the image holds NaN or infinity, expected values in [0, 1]; write an .exr to keep "
+            "them"
+        )
     top = 2**bits - 1
-    attributes = {"Compression": "jpeg:95", "jpeg:subsampling": "4:4:4"} if path.suffix.lower() in (".jpg", ".jpeg") else {}
-    integers = (image.detach().cpu().double().clamp(0, 1) * top).round().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+    attributes = (
+        {"Compression": "jpeg:95", "jpeg:subsampling": "4:4:4"} if path.suffix.lower() in (".jpg", ".jpeg") else {}
+    )
+    integers = (
+        (image.detach().cpu().double().clamp(0, 1) * top).round().numpy().astype(np.uint8 if bits == 8 else np.uint16)
+    )
     _encode(path, rearrange(integers, "c h w -> h w c"), None, attributes)
 
 
@@ -174,7 +192,9 @@ def write_exr(path: str | Path, channels: Mapping[str, Float[Tensor, "h w"]]) ->
     """Writes named float32 channels of one size, losslessly compressed (for raymaps, depth, normals)."""
     sizes = {tuple(channel.shape) for channel in channels.values()}
     if len(sizes) != 1:
-        raise ValueError(f"write_exr {path}: expected at least one channel and one size for all of them, got sizes {sorted(sizes)}")
+        raise ValueError(
+            f"write_exr {path}: expected at least one channel and one size for all of them, got sizes {sorted(sizes)}"
+        )
     stacked = torch.stack([channel.detach().cpu().float() for channel in channels.values()], dim=-1).numpy()
     _encode(Path(path), stacked, list(channels), {"Compression": "zip"})
 
@@ -216,7 +236,8 @@ def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tens
 
 
 def shrink(image: Float[Tensor, "c h w"], longest_side: int | None) -> Float[Tensor, "c h2 w2"]:
-    """The image made smaller, so that its longer side has at most ``longest_side`` pixels: a new pixel is the mean of the area it covers.
+    """The image made smaller, so that its longer side has at most ``longest_side`` pixels: a new pixel is the mean of
+    the area it covers.
 
     An image that is small enough already, or None, comes back as it is. No side becomes shorter than one pixel.
     """
@@ -252,7 +273,9 @@ def _checked_file(path: str | Path) -> Path:
         elif start[:4] == b"RIFF" and start[8:12] == b"WEBP":
             complete = path.stat().st_size >= 8 + int.from_bytes(start[4:8], "little")
     if not complete:
-        raise ValueError(f"image {path}: the file is truncated (it ends before the image does); copy it again from its source")
+        raise ValueError(
+            f"image {path}: the file is truncated (it ends before the image does); copy it again from its source"
+        )
     return path
 
 
@@ -315,8 +338,11 @@ def _encode(path: Path, array: np.ndarray, names: list[str] | None, attributes: 
         spec.channelnames = tuple(names)
     for key, value in attributes.items():
         spec.attribute(key, value)
-    # On a full disk OpenImageIO's PNG writer cuts the file short without a word, and its JPEG writer ends the whole process.
+    # On a full disk OpenImageIO's PNG writer cuts the file short without a word, and its JPEG writer ends the whole
+    # process.
     with by_way_of_memory(path) as place:
         done = writer.open(place, spec) and writer.write_image(np.ascontiguousarray(array)) and writer.close()
         if not done:
-            raise ValueError(f"cannot write {path} ({one_line(writer.geterror())}); check that the folder exists and has room")
+            raise ValueError(
+                f"cannot write {path} ({one_line(writer.geterror())}); check that the folder exists and has room"
+            )

@@ -1,6 +1,8 @@
-"""How the kinds of picture files are decoded: pixels as they are meant to be shown, names of channels, the orientation tag.
+"""How the kinds of picture files are decoded: pixels as they are meant to be shown, names of channels, the orientation
+tag.
 
-OpenImageIO reads all but HEIC; both are imported on first use. Source of the EXR windows: OpenEXR's technical introduction; of the layers'
+OpenImageIO reads all but HEIC; both are imported on first use. Source of the EXR windows: OpenEXR's technical
+introduction; of the layers'
 names: Blender's multi-layer files.
 """
 
@@ -16,7 +18,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.limits import require_decodable
+from fb_core.files.limits import require_decodable
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 LEAST_ALPHA = 1e-6
@@ -25,18 +27,24 @@ LEAST_ALPHA = 1e-6
 
 @contextmanager
 def told(path: Path) -> Iterator[None]:
-    """Whatever a decoder raises inside becomes a ValueError that names the file; what the operating system says stays."""
+    """Whatever a decoder raises inside becomes a ValueError that names the file; what the operating system says
+    stays.
+    """
     try:
         yield
     except (ValueError, OSError, MemoryError):
         raise
     except Exception as error:
         kind = type(error).__name__
-        raise ValueError(f"image {path}: not readable ({kind}: {one_line(str(error))[:200]}); copy it again or convert it") from error
+        raise ValueError(
+            f"image {path}: not readable ({kind}: {one_line(str(error))[:200]}); copy it again or convert it"
+        ) from error
 
 
 def colour_channels(names: list[str], path: Path) -> tuple[list[int], int | None]:
-    """(places of R, G, B, or that of grey; place of alpha) among a file's channels; of several layers, those of Blender's Combined."""
+    """(places of R, G, B, or that of grey; place of alpha) among a file's channels; of several layers, those of
+    Blender's Combined.
+    """
     place = {name: index for index, name in reversed(list(enumerate(names)))}
     layers = [name[:-1] for name in names if name.endswith(".R") and {f"{name[:-1]}G", f"{name[:-1]}B"} <= set(names)]
     combined = [layer for layer in layers if layer.endswith("Combined.")]
@@ -44,9 +52,15 @@ def colour_channels(names: list[str], path: Path) -> tuple[list[int], int | None
         if all(f"{layer}{name}" in place for name in "RGB"):
             return [place[f"{layer}{name}"] for name in "RGB"], place.get(f"{layer}A")
     is_place = {"X", "Y", "Z"} <= set(names)  # places or normals, whose Y is no luminance
-    grey = [] if is_place else [place[name] for name in ("Y", "I", "L") if name in place] or ([0] if len(names) == 1 else [])
+    grey = (
+        []
+        if is_place
+        else [place[name] for name in ("Y", "I", "L") if name in place] or ([0] if len(names) == 1 else [])
+    )
     if not grey:
-        raise ValueError(f"image {path}: expected channels R, G, B or one grey channel, got {names}; read it with read_exr")
+        raise ValueError(
+            f"image {path}: expected channels R, G, B or one grey channel, got {names}; read it with read_exr"
+        )
     return grey[:1], place.get("A")
 
 
@@ -58,7 +72,10 @@ def opened(path: Path):
     settings.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), settings)
     if reader is None:
-        raise ValueError(f"image {path}: not readable as an image ({one_line(oiio.geterror())}); expected JPEG, PNG, TIFF, EXR or WebP")
+        raise ValueError(
+            f"image {path}: not readable as an image ({one_line(oiio.geterror())}); expected JPEG, PNG, TIFF, EXR or "
+            "WebP"
+        )
     return reader
 
 
@@ -79,7 +96,11 @@ def decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     pixels = rearrange(torch.from_numpy(np.ascontiguousarray(array)), "h w c -> c h w")
     planes = pixels.to(torch.float32, memory_format=torch.contiguous_format)
     planes, names = planes.div_(255) if kind == oiio.UINT8 else planes, list(spec.channelnames)
-    if path.suffix.lower() in TIFF_SUFFIXES and "A" in names and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
+    if (
+        path.suffix.lower() in TIFF_SUFFIXES
+        and "A" in names
+        and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
+    ):
         planes = _unmultiplied(planes, names.index("A"))
     if (spec.x, spec.y, spec.height, spec.width) != (spec.full_x, spec.full_y, height, width):
         planes, names = _in_display_window(planes, names, spec)
@@ -98,14 +119,21 @@ def covers_display(spec) -> bool:
     return left <= 0 and top <= 0 and left + spec.width >= width and top + spec.height >= height
 
 
-def _in_display_window(planes: Float[Tensor, "c h w"], names: list[str], spec) -> tuple[Float[Tensor, "c2 h2 w2"], list[str]]:
-    """The data window's pixels where they stand in the display window; what is beyond is cut, what is missing is transparent."""
+def _in_display_window(
+    planes: Float[Tensor, "c h w"], names: list[str], spec
+) -> tuple[Float[Tensor, "c2 h2 w2"], list[str]]:
+    """The data window's pixels where they stand in the display window; what is beyond is cut, what is missing is
+    transparent.
+    """
     height, width = display_size(spec)
     left, top = spec.x - spec.full_x, spec.y - spec.full_y
     if not covers_display(spec) and "A" not in names:
         planes, names = torch.cat([planes, torch.ones_like(planes[:1])]), [*names, "A"]
     shown = planes.new_zeros(len(planes), height, width)
-    rows, columns = slice(max(top, 0), min(top + spec.height, height)), slice(max(left, 0), min(left + spec.width, width))
+    rows, columns = (
+        slice(max(top, 0), min(top + spec.height, height)),
+        slice(max(left, 0), min(left + spec.width, width)),
+    )
     if rows.start < rows.stop and columns.start < columns.stop:
         part = planes[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
         shown[:, rows, columns] = part
@@ -137,7 +165,9 @@ def decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
     try:
         array = np.array(image)
     except (OSError, RuntimeError, SyntaxError, ValueError) as error:
-        raise ValueError(f"image {path}: damaged or truncated HEIC ({one_line(str(error))}); copy it again from its source") from error
+        raise ValueError(
+            f"image {path}: damaged or truncated HEIC ({one_line(str(error))}); copy it again from its source"
+        ) from error
     planes = torch.from_numpy(array.astype(np.float32) / np.iinfo(array.dtype).max)
     pixels = planes[None] if array.ndim == 2 else rearrange(planes, "h w c -> c h w")
     return pixels, list(image.mode.split(";")[0]), 1  # modes are RGB, RGBA, L, LA, and those with ;16
@@ -149,12 +179,15 @@ def opened_heif(path: Path):
         import pillow_heif  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError(
-            f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install 'fillerbuster[heic]' or convert to JPEG"
+            f"image {path}: reading HEIC needs the package pillow-heif; install it with pip install "
+            "'fillerbuster[heic]' or convert to JPEG"
         ) from error
     try:
         return pillow_heif.open_heif(path)
     except (OSError, RuntimeError, SyntaxError, ValueError) as error:
-        raise ValueError(f"image {path}: not readable as HEIC ({one_line(str(error))}); copy it again or convert it to JPEG") from error
+        raise ValueError(
+            f"image {path}: not readable as HEIC ({one_line(str(error))}); copy it again or convert it to JPEG"
+        ) from error
 
 
 def upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, "c h2 w2"]:

@@ -10,7 +10,8 @@ _RADIUS = 3  # pixels
 
 
 def telea(image: Float[Tensor, "3 h w"], known: Bool[Tensor, "h w"], *, radius: int) -> Float[Tensor, "3 h w"]:
-    """The picture (RGB in [0, 1], rounded to 8 bits) with its unknown pixels continued from the known ones (there must be some).
+    """The picture (RGB in [0, 1], rounded to 8 bits) with its unknown pixels continued from the known ones (there must
+    be some).
 
     ``radius``: pixels around a hole's border that are looked at.
     """

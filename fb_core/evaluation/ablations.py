@@ -1,4 +1,6 @@
-"""The paper's comparison of model designs (table 2): sequences of N views of unseen rooms, N/4 known, N/4 partly, the rest generated."""
+"""The paper's comparison of model designs (table 2): sequences of N views of unseen rooms, N/4 known, N/4 partly, the
+rest generated.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import encode_in_chunks, encode_known, join, stacked_facts, unsplit
-from fb_core.data.capture_questions import CaptureViews
-from fb_core.data.rooms import require_family
+from fb_core.data.rooms.room import require_family
+from fb_core.evaluation.capture_questions import CaptureViews
 from fb_core.evaluation.completion import RoomViews, unseen_room
-from fb_core.evaluation.image_metrics import psnr, ssim
+from fb_core.evaluation.metrics.image_metrics import psnr, ssim
 from fb_core.flow import validation_loss
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.masks import training_mixture
-from fb_core.networks.embeddings import index_positions
+from fb_core.networks.transformer.embeddings import index_positions
 from fb_core.views import Views
 
 Distance = Callable[[Tensor, Tensor], Tensor]
@@ -80,10 +82,11 @@ def evaluate_design(
     distance: Distance | None = None,
     on_sequence: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[dict[str, float]]:
-    """One row for each length: means over sequences of PSNR (dB), SSIM, and the image channels' validation loss at ``times`` times;
-    LPIPS with a ``distance``.
+    """One row for each length: means over sequences of PSNR (dB), SSIM, and the image channels' validation loss at
+    ``times`` times; LPIPS with a ``distance``.
 
-    Pictures are scored whole, in all views that were not wholly known; what was known of them counts too (as in the paper's code).
+    Pictures are scored whole, in all views that were not wholly known; what was known of them counts too (as in the
+    paper's code).
     """
     rows, done, total = [], 0, sum(map(len, asked.values()))
     for length, sequences in asked.items():
@@ -97,7 +100,9 @@ def evaluate_design(
     return rows
 
 
-def sequence_scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: int, distance: Distance | None) -> dict[str, float]:
+def sequence_scores(
+    model: Fillerbuster, asked: Asked, sampling: SamplingConfig, times: int, distance: Distance | None
+) -> dict[str, float]:
     """PSNR (dB), SSIM, LPIPS with a ``distance``, and VAL of one sequence, as `evaluate_design` averages them."""
     room, known, seed = asked
     views = dataclasses.replace(Views.known(room.images, room.cameras), image_known=known)
@@ -118,9 +123,16 @@ def sequence_scores(model: Fillerbuster, asked: Asked, sampling: SamplingConfig,
 
 @torch.no_grad()
 def conditional_validation_loss(
-    model: Fillerbuster, room: RoomViews | CaptureViews, known: Float[Tensor, "n 1 h w"], *, times: int = 20, seed: int = 0
+    model: Fillerbuster,
+    room: RoomViews | CaptureViews,
+    known: Float[Tensor, "n 1 h w"],
+    *,
+    times: int = 20,
+    seed: int = 0,
 ) -> float:
-    """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over equally spaced times."""
+    """VAL of the paper's table 2: the predicted image velocity's error, given the known pixels and all rays, over
+    equally spaced times.
+    """
     images, known = room.images.to(model.device), known.to(model.device)
     rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras))).to(model.device)
     conditioning = encode_known(
@@ -134,7 +146,9 @@ def conditional_validation_loss(
         transformer=model.dit.config,
     )
     facts = stacked_facts([conditioning], model.dit.config)
-    data = unsplit(encode_in_chunks(model.image_vae, images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[None]
+    data = unsplit(encode_in_chunks(model.image_vae, images, _CHUNK), encode_in_chunks(model.raymap_vae, rays, _CHUNK))[
+        None
+    ]
     noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed)).to(data)
     index = index_positions(model.dit.config.index, 1, data.shape[1], device=data.device)
     text = None if model.text is None else model.text[None]

@@ -1,4 +1,6 @@
-"""How well a model completes unseen rooms: generated views against simple baselines, view by view, from ground truth."""
+"""How well a model completes unseen rooms: generated views against simple baselines, view by view, from ground
+truth.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.data.ray_caster import render
-from fb_core.data.room_cameras import training_cameras
-from fb_core.data.rooms import FAMILIES, Room, make_room, require_family
+from fb_core.data.rooms.ray_caster import render
+from fb_core.data.rooms.room import FAMILIES, Room, make_room, require_family
+from fb_core.data.rooms.room_cameras import training_cameras
 from fb_core.data.telea import inpainted
-from fb_core.evaluation.image_metrics import psnr
+from fb_core.evaluation.metrics.image_metrics import psnr
 from fb_core.evaluation.reprojection import reproject
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, Carried, carried_over
@@ -106,8 +108,14 @@ def mean_color(images: Float[Tensor, "k 3 h w"], count: int) -> Float[Tensor, "m
 
 def baselines(given: RoomViews, hidden: Pinholes) -> dict[str, Float[Tensor, "m 3 h w"]]:
     """What one has without a model. The one by true depth knows what nobody has at hand: a bound, not a competitor."""
-    answers = {"nearest": nearest_known(given.images, given.cameras, hidden), "mean": mean_color(given.images, len(hidden))}
-    for name, depth in (("reprojected", torch.full_like(given.depth, _FAR)), ("reprojected by true depth", given.depth)):
+    answers = {
+        "nearest": nearest_known(given.images, given.cameras, hidden),
+        "mean": mean_color(given.images, len(hidden)),
+    }
+    for name, depth in (
+        ("reprojected", torch.full_like(given.depth, _FAR)),
+        ("reprojected by true depth", given.depth),
+    ):
         answers[name] = inpainted(*reproject(given.images, depth, given.cameras, hidden))
     return answers
 
@@ -124,7 +132,8 @@ def complete_hidden(
 ) -> Float[Tensor, "m 3 h w"]:
     """The hidden views as the model generates them in one sequence with the given ones.
 
-    ``start`` is a guess of them, there where ``start_known`` is 1 (default: everywhere), which enters as ``sampling.guess`` says.
+    ``start`` is a guess of them, there where ``start_known`` is 1 (default: everywhere), which enters as
+    ``sampling.guess`` says.
     """
     known = Views.known(given.images, given.cameras)
     views = Views.cat([known, Views.unknown(hidden)])
@@ -168,10 +177,11 @@ def evaluate_completion(
     told: bool = False,
     on_room: Callable[[int, int], None] | None = None,
 ) -> Iterable[RoomResult]:
-    """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields each result.
+    """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields
+    each result.
 
-    With several ``samples`` their mean is scored, too; with ``told`` the model that is told what is carried over, which is then what is
-    shown as completed. ``sampling`` None is what the model's folder recommends.
+    With several ``samples`` their mean is scored, too; with ``told`` the model that is told what is carried over, which
+    is then what is shown as completed. ``sampling`` None is what the model's folder recommends.
     """
     sampling = model.recommended_sampling if sampling is None else sampling
     averaged = (mean_of(samples),) if samples > 1 else ()
@@ -187,30 +197,41 @@ def evaluate_completion(
         if told:
             guess = _told_guess(given, hidden.cameras)
             later = dataclasses.replace(sampling, guess="told", belief=BELIEF_BY_DIRECTION)
-            answers[TOLD] = complete_hidden(model, given, hidden.cameras, later, seed=seed, start=guess.images, start_known=guess.there)
+            answers[TOLD] = complete_hidden(
+                model, given, hidden.cameras, later, seed=seed, start=guess.images, start_known=guess.there
+            )
         if averaged:
             others = [_OTHER_SAMPLE * other + seed for other in range(1, samples)]
-            drawn = [completed, *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others)]
+            drawn = [
+                completed,
+                *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others),
+            ]
             answers[mean_of(samples)] = torch.stack(drawn).mean(dim=0)
         methods = (*METHODS, *map(started_at, strengths), *((TOLD,) if told else ()), *averaged)
         errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in methods}
         edges = {name: edge_energy(answers[name], hidden.images) for name in methods}
         yield RoomResult(
-            truth=room.images, completed=torch.cat([given.images, answers[TOLD] if told else completed]), psnr=errors, edges=edges
+            truth=room.images,
+            completed=torch.cat([given.images, answers[TOLD] if told else completed]),
+            psnr=errors,
+            edges=edges,
         )
         if on_room is not None:
             on_room(number + 1, task.rooms)
 
 
 def summary(results: list[RoomResult]) -> dict[str, dict[str, float]]:
-    """Mean PSNR over rooms, and how far that is above the pixels carried over by direction, with standard errors, per method.
+    """Mean PSNR over rooms, and how far that is above the pixels carried over by direction, with standard errors, per
+    method.
 
     The second is the mean of differences room by room, which is far surer than the difference of the means.
     """
     rows = {}
     for method in results[0].psnr:
         above = mean_psnr([result.psnr[method] - result.psnr["reprojected"] for result in results])
-        rows[method] = mean_psnr([result.psnr[method] for result in results]) | {f"above_{name}": value for name, value in above.items()}
+        rows[method] = mean_psnr([result.psnr[method] for result in results]) | {
+            f"above_{name}": value for name, value in above.items()
+        }
         if method in results[0].edges:
             rows[method]["edges"] = sum(result.edges[method] for result in results) / len(results)
     return rows

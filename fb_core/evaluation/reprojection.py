@@ -15,9 +15,11 @@ _NEAREST = 1.02  # points of one pixel within this factor of the nearest depth a
 def reproject(
     images: Float[Tensor, "k 3 h w"], depth: Float[Tensor, "k h w"], known: Pinholes, unknown: Pinholes
 ) -> tuple[Float[Tensor, "m 3 h w"], Bool[Tensor, "m h w"]]:
-    """Every known pixel drawn as one point into the unknown cameras, nearest surface first; also returns where something was drawn.
+    """Every known pixel drawn as one point into the unknown cameras, nearest surface first; also returns where
+    something was drawn.
 
-    ``depth`` is the z-depth of the known pixels in scene units. Pixels on which several points of the nearest surface fall get their mean.
+    ``depth`` is the z-depth of the known pixels in scene units. Pixels on which several points of the nearest surface
+    fall get their mean.
     """
     height, width = unknown.height, unknown.width
     points = rearrange(known.unproject(depth), "k h w c -> (k h w) c")
@@ -27,7 +29,9 @@ def reproject(
     return torch.stack([picture for picture, _ in pictures]), torch.stack([drawn for _, drawn in pictures])
 
 
-def _draw(pixels: Float[Tensor, "p 2"], depths: Float[Tensor, "p"], colors: Float[Tensor, "p 3"], height: int, width: int):
+def _draw(
+    pixels: Float[Tensor, "p 2"], depths: Float[Tensor, "p"], colors: Float[Tensor, "p 3"], height: int, width: int
+):
     column, row = pixels.floor().unbind(dim=1)
     visible = (depths > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     place = (row * width + column)[visible].long()

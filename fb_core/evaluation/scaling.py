@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from fb_core.data.rooms import require_family
+from fb_core.data.rooms.room import require_family
 from fb_core.evaluation.completion import RoomViews, complete_hidden, mean_psnr, unseen_room
-from fb_core.evaluation.image_metrics import psnr
+from fb_core.evaluation.metrics.image_metrics import psnr
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 
@@ -54,8 +54,13 @@ def evaluate_scaling(
     model: Fillerbuster, task: ScalingTask, sampling: SamplingConfig, *, on_room: OnRoom = lambda _: None
 ) -> list[dict[str, float | int | str]]:
     """One row for each context and each length: mean PSNR in dB over rooms, and its standard error."""
-    longest = max((task.scored + max(task.contexts, default=0), *(length * task.trained_views for length in task.lengths)))
-    rooms = [unseen_room(family=task.family, seed=task.seed, number=number, views=longest, size=model.size) for number in range(task.rooms)]
+    longest = max(
+        (task.scored + max(task.contexts, default=0), *(length * task.trained_views for length in task.lengths))
+    )
+    rooms = [
+        unseen_room(family=task.family, seed=task.seed, number=number, views=longest, size=model.size)
+        for number in range(task.rooms)
+    ]
     rows: list[dict[str, float | int | str]] = []
     for known in task.contexts:
         on_room(f"{known} known views")
@@ -70,12 +75,21 @@ def evaluate_scaling(
 
 
 def _errors(
-    model: Fillerbuster, rooms: Iterable[RoomViews], known: int, unscored: int, task: ScalingTask, sampling: SamplingConfig
+    model: Fillerbuster,
+    rooms: Iterable[RoomViews],
+    known: int,
+    unscored: int,
+    task: ScalingTask,
+    sampling: SamplingConfig,
 ) -> list[float]:
     """PSNR of the scored views in each room, completed together with further unknown views."""
     means = []
     for number, room in enumerate(rooms):
-        scored, given, further = room[: task.scored], room[task.scored : task.scored + known], room[task.scored + known :][:unscored]
+        scored, given, further = (
+            room[: task.scored],
+            room[task.scored : task.scored + known],
+            room[task.scored + known :][:unscored],
+        )
         asked = Pinholes.cat([scored.cameras, further.cameras]) if unscored else scored.cameras
         completed = complete_hidden(model, given, asked, sampling, seed=task.seed + number)
         means.append(float(psnr(completed[: task.scored], scored.images).mean()))

@@ -1,4 +1,6 @@
-"""Poses -> views -> poses: whether generated views look as if they were taken where they were asked for. Needs no ground truth."""
+"""Poses -> views -> poses: whether generated views look as if they were taken where they were asked for. Needs no
+ground truth.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.data.photos import Photo
-from fb_core.evaluation.pose_metrics import pose_errors
+from fb_core.data.photos.photo import Photo
+from fb_core.evaluation.metrics.pose_metrics import pose_errors
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.registration import register
+from fb_core.registration.choice import register
 
 
-def photo_of(image: Float[Tensor, "3 h w"], *, name: str, device: str, focal: float | None = None, camera: Pinholes | None = None) -> Photo:
+def photo_of(
+    image: Float[Tensor, "3 h w"], *, name: str, device: str, focal: float | None = None, camera: Pinholes | None = None
+) -> Photo:
     """A picture in memory as a photo."""
     image = image.detach().cpu()
 
@@ -51,7 +55,8 @@ def self_consistency(
 
     Args:
         images: given and generated pictures, RGB in [0, 1], of any sizes; two or more.
-        cameras: of each, a batch of one for the picture's own size: recovered ones of given pictures, those asked for of generated ones.
+        cameras: of each, a batch of one for the picture's own size: recovered ones of given pictures, those asked for
+            of generated ones.
         method: as in `register`.
         model: for the method "model".
         seed: decides the samples.
@@ -61,7 +66,11 @@ def self_consistency(
     Returns what `pose_errors` does, and `trusted_share`: of all pictures, those whose recovered camera is trusted.
     """
     photos = [
-        photo_of(image, name=f"view {number}", device=f"{image.shape[2]} x {image.shape[1]}, focal length {float(camera.focal[0, 0]):.4g}")
+        photo_of(
+            image,
+            name=f"view {number}",
+            device=f"{image.shape[2]} x {image.shape[1]}, focal length {float(camera.focal[0, 0]):.4g}",
+        )
         for number, (image, camera) in enumerate(zip(images, cameras, strict=True))
     ]
     found = register(photos, method=method, model=model, seed=seed, sampling=sampling, views_at_once=views_at_once)

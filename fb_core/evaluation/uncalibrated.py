@@ -1,4 +1,6 @@
-"""Unposed views of unseen rooms: how well their cameras are recovered, by which method, and what a fly-through made from them is worth."""
+"""Unposed views of unseen rooms: how well their cameras are recovered, by which method, and what a fly-through made
+from them is worth.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.data.photos import Photo
-from fb_core.data.ray_caster import render
+from fb_core.data.photos.photo import Photo
+from fb_core.data.rooms.ray_caster import render
 from fb_core.evaluation.completion import mean_color, unseen_house, unseen_room
-from fb_core.evaluation.image_metrics import psnr
-from fb_core.evaluation.pose_metrics import aligned, pose_errors
+from fb_core.evaluation.metrics.image_metrics import psnr
+from fb_core.evaluation.metrics.pose_metrics import aligned, pose_errors
 from fb_core.evaluation.self_consistency import photo_of, self_consistency
-from fb_core.geometry.camera_paths import path_cameras
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.feature_chain import FOCAL_GUESS
+from fb_core.geometry.features.chain import FOCAL_GUESS
+from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_core.inpainter import Fillerbuster
-from fb_core.registration import register
+from fb_core.registration.choice import register
 from fb_core.views import Views
 
 
@@ -49,7 +51,9 @@ class UncalibratedTask:
 
     def __post_init__(self) -> None:
         if self.rooms < 1 or self.views < 2 or self.path < 1:
-            raise ValueError(f"uncalibrated evaluation: expected rooms and path of at least 1 and views of at least 2, got {self}")
+            raise ValueError(
+                f"uncalibrated evaluation: expected rooms and path of at least 1 and views of at least 2, got {self}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +82,11 @@ Outcome = dict[tuple[str, str], dict[str, float]]
 def evaluate_uncalibrated(
     model: Fillerbuster, task: UncalibratedTask, *, on_room: Callable[[str], None] = lambda _: None
 ) -> Iterator[Outcome]:
-    """Of one room after the other: cameras by method, fly-throughs made from them, and the closed loop poses -> views -> poses.
+    """Of one room after the other: cameras by method, fly-throughs made from them, and the closed loop poses -> views
+    -> poses.
 
-    Errors are taken after the best similarity to the truth, which also places the fly-through in each method's own world.
+    Errors are taken after the best similarity to the truth, which also places the fly-through in each method's own
+    world.
     """
     for number in range(task.rooms):
         on_room(f"room {number + 1} of {task.rooms}")
@@ -108,16 +114,24 @@ def evaluate_uncalibrated(
 def evaluate_capture(
     model: Fillerbuster, photos: Sequence[Photo], *, seed: int, on_method: Callable[[str], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Rows of errors of photos whose cameras are known, once these are hidden: by the model and by features, focal lengths told or not."""
+    """Rows of errors of photos whose cameras are known, once these are hidden: by the model and by features, focal
+    lengths told or not.
+    """
     truth = [photo.camera for photo in photos if photo.camera is not None]
     if len(truth) != len(photos) or len(photos) < 2:
-        raise ValueError(f"capture: expected at least two photos with cameras, got {len(photos)} photos, {len(truth)} of them with cameras")
+        raise ValueError(
+            f"capture: expected at least two photos with cameras, got {len(photos)} photos, {len(truth)} of them with "
+            "cameras"
+        )
     rows: list[dict[str, Any]] = []
     for method in ("features", "model"):
         for told in (True, False):
             name = f"{method}, focal length {'told' if told else 'unknown'}"
             on_method(name)
-            hidden = [dataclasses.replace(photo, camera=None, focal_prior=photo.focal_prior if told else None) for photo in photos]
+            hidden = [
+                dataclasses.replace(photo, camera=None, focal_prior=photo.focal_prior if told else None)
+                for photo in photos
+            ]
             began = time.process_time()
             found = register(hidden, method=method, model=model if method == "model" else None, seed=seed)
             seconds = time.process_time() - began
@@ -181,24 +195,39 @@ def _by_model(model: Fillerbuster, scene: _Scene, seed: int) -> _Answer:
 
 
 def _registered(
-    images: Float[Tensor, "n 3 s s"], size: int, *, method: Literal["model", "features"], model: Fillerbuster | None, seed: int
+    images: Float[Tensor, "n 3 s s"],
+    size: int,
+    *,
+    method: Literal["model", "features"],
+    model: Fillerbuster | None,
+    seed: int,
 ) -> _Answer:
     photos = [photo_of(image, name=f"view {index}", device="one") for index, image in enumerate(images)]
     began = time.process_time()
     found = register(photos, method=method, model=model, seed=seed)
     seconds = time.process_time() - began
     cameras = [None if camera is None else camera.scaled(size, size) for camera in found.cameras]
-    return _Answer(cameras=cameras, trusted_share=sum(verdict == "ok" for verdict in found.verdicts) / len(photos), cpu_seconds=seconds)
+    return _Answer(
+        cameras=cameras,
+        trusted_share=sum(verdict == "ok" for verdict in found.verdicts) / len(photos),
+        cpu_seconds=seconds,
+    )
 
 
-def _fly_through(model: Fillerbuster, scene: _Scene, found: Sequence[Pinholes | None], seed: int) -> Float[Tensor, "m 3 s s"] | None:
-    """The path's views, generated from the pictures that have a camera; the path is brought into the world of the found cameras."""
+def _fly_through(
+    model: Fillerbuster, scene: _Scene, found: Sequence[Pinholes | None], seed: int
+) -> Float[Tensor, "m 3 s s"] | None:
+    """The path's views, generated from the pictures that have a camera; the path is brought into the world of the found
+    cameras.
+    """
     similarity = aligned(found, _each(scene.cameras))
     there = [index for index, camera in enumerate(found) if camera is not None]
     if similarity is None or not there:
         return None
     cameras = Pinholes.cat([camera.to(torch.float32) for camera in found if camera is not None])
-    if similarity.scale < 1e-6:  # found places that tell nothing: nor do they tell where the path runs, but it keeps its unit
+    if (
+        similarity.scale < 1e-6
+    ):  # found places that tell nothing: nor do they tell where the path runs, but it keeps its unit
         similarity = dataclasses.replace(similarity, scale=1.0, shift=scene.cameras.centers.double().mean(dim=0))
     path = similarity.inverse.cameras(scene.path)
     views = Views.cat([Views.known(scene.images[there], cameras), Views.unknown(path.to(torch.float32))])

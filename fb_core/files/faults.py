@@ -31,10 +31,11 @@ class CannotWrite(OSError):
 
 @contextmanager
 def telling(target: Path, unfinished: Path) -> Iterator[None]:
-    """Errors of writing below ``unfinished``, which becomes ``target``, become :class:`CannotWrite`; all others pass unchanged.
+    """Errors of writing below ``unfinished``, which becomes ``target``, become :class:`CannotWrite`; all others pass
+    unchanged.
 
-    Libraries in C++ and Rust say with errors of their own, or with none of the system's numbers, that a disk is full. Where one of
-    these arrives, a probe of 1 MiB tells whether the disk takes anything at all.
+    Libraries in C++ and Rust say with errors of their own, or with none of the system's numbers, that a disk is full.
+    Where one of these arrives, a probe of 1 MiB tells whether the disk takes anything at all.
     """
     try:
         yield
@@ -68,7 +69,12 @@ def is_of_the_disk(error: BaseException) -> bool:
 
 def sentence_of(error: BaseException) -> str:
     """An error's own text, or what to do where it says that a disk is full or cannot be written."""
-    if isinstance(error, OSError) and not isinstance(error, CannotWrite) and is_of_the_disk(error) and error.filename is not None:
+    if (
+        isinstance(error, OSError)
+        and not isinstance(error, CannotWrite)
+        and is_of_the_disk(error)
+        and error.filename is not None
+    ):
         return str(CannotWrite(Path(os.fsdecode(error.filename)), error))
     return str(error)
 

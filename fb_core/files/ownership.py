@@ -1,8 +1,9 @@
 """Which folders and files a command may replace: those that carry its own mark, and that hold nothing it reads.
 
-Every folder that is written here holds a small file, ``.fillerbuster.json``: who made it, of what kind it is, and the names of all its
-files. A folder without that mark is somebody else's, whatever it looks like; so is every file in it that the mark does not name.
-Single files whose names people type (sheets, figures, tables) say in themselves who made them.
+Every folder that is written here holds a small file, ``.fillerbuster.json``: who made it, of what kind it is, and the
+names of all its files. A folder without that mark is somebody else's, whatever it looks like; so is every file in it
+that the mark does not name. Single files whose names people type (sheets, figures, tables) say in themselves who made
+them.
 """
 
 from __future__ import annotations
@@ -44,8 +45,12 @@ class Target:
     """Whether a folder without a mark is beyond doubt one that an older version of this program has made."""
 
     def check(self) -> None:
-        """Raises ValueError in one sentence for a folder that must not be written. Links are neither followed nor replaced."""
-        folder = real_place(self.folder)  # what is written: "missing/.." leads somewhere though the system does not find it yet
+        """Raises ValueError in one sentence for a folder that must not be written. Links are neither followed nor
+        replaced.
+        """
+        folder = real_place(
+            self.folder
+        )  # what is written: "missing/.." leads somewhere though the system does not find it yet
         if folder.is_symlink():
             raise ValueError(f"{folder} is a link, which is neither followed nor replaced; choose another folder")
         if not folder.exists():
@@ -55,20 +60,31 @@ class Target:
         if os.path.ismount(folder):  # the system lets nothing take its place, and would say so only after all the work
             raise ValueError(f"{folder} is the root of a disk, whose place nothing can take; choose a new folder in it")
         if _is_or_holds(folder, _here()):  # else whoever works in it is left in a folder that is there no more
-            raise ValueError(f"{folder} is, or holds, the folder that this command was started in; choose a new folder in it")
+            raise ValueError(
+                f"{folder} is, or holds, the folder that this command was started in; choose a new folder in it"
+            )
         for given in self.inputs:
             if _is_or_holds(folder, given):
                 raise ValueError(f"{folder} holds the input {given}; choose another folder")
         if not any(folder.iterdir()):
             return
         if not self.overwrite:
-            raise ValueError(f"{folder} exists already and is not empty; choose another folder, or replace it with --overwrite")
+            raise ValueError(
+                f"{folder} exists already and is not empty; choose another folder, or replace it with --overwrite"
+            )
         for given in self.inputs:
             if given.is_dir() and _is_or_holds(given, folder):
-                raise ValueError(f"{folder} lies in the input {given}, so that --overwrite does not touch it; choose a folder outside")
-        if not (kind_of(folder) == self.kind or (kind_of(folder) is None and self.earlier is not None and self.earlier(folder))):
+                raise ValueError(
+                    f"{folder} lies in the input {given}, so that --overwrite does not touch it; choose a folder "
+                    "outside"
+                )
+        if not (
+            kind_of(folder) == self.kind
+            or (kind_of(folder) is None and self.earlier is not None and self.earlier(folder))
+        ):
             raise ValueError(
-                f"{folder} holds something else than an earlier {self.kind}, so that --overwrite does not touch it; choose another folder"
+                f"{folder} holds something else than an earlier {self.kind}, so that --overwrite does not touch it; "
+                "choose another folder"
             )
 
 
@@ -78,7 +94,8 @@ def as_target(folder: Path | Target, kind: str) -> Target:
 
 
 def require_own_or_new(path: Path) -> None:
-    """Raises ValueError in one sentence where a file is to be written in whose place stands one that is no earlier result.
+    """Raises ValueError in one sentence where a file is to be written in whose place stands one that is no earlier
+    result.
 
     Pipes and devices are written as they are.
     """
@@ -97,8 +114,12 @@ def require_own_or_new(path: Path) -> None:
             ends = file.read()
     except OSError:
         begins = ends = b""
-    if not any(re.match(first, begins) and (re.search(also, begins) or re.search(also, ends)) for first, also in _RESULTS):
-        raise ValueError(f"{path} exists already and is no earlier result of this program; choose another name, or move it away")
+    if not any(
+        re.match(first, begins) and (re.search(also, begins) or re.search(also, ends)) for first, also in _RESULTS
+    ):
+        raise ValueError(
+            f"{path} exists already and is no earlier result of this program; choose another name, or move it away"
+        )
 
 
 def signature(path: Path) -> dict[str, str]:
@@ -119,15 +140,21 @@ def mark_text(kind: str, files: list[str]) -> str:
 
 
 def kind_of(folder: Path) -> str | None:
-    """What the folder's mark says that it holds; None without a mark, or with one that does not say all that a mark says."""
+    """What the folder's mark says that it holds; None without a mark, or with one that does not say all that a mark
+    says.
+    """
     told = _mark(folder)
     return None if told is None else told["kind"]
 
 
 def foreign_files(folder: Path) -> list[str]:
-    """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no mark tells."""
+    """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no
+    mark tells.
+    """
     told = _mark(folder)
-    return [] if told is None else sorted(set(_files(folder)) - {name for name in told["files"] if isinstance(name, str)})
+    return (
+        [] if told is None else sorted(set(_files(folder)) - {name for name in told["files"] if isinstance(name, str)})
+    )
 
 
 def _mark(folder: Path) -> dict | None:
@@ -160,10 +187,16 @@ def _files(folder: Path) -> list[str]:
 
 def real_place(folder: Path) -> Path:
     """The folder with the links of all folders above it followed; its own name stays, link or not."""
-    return Path(os.path.realpath(folder)) if folder.name in ("", "..") else Path(os.path.realpath(folder.parent)) / folder.name
+    return (
+        Path(os.path.realpath(folder))
+        if folder.name in ("", "..")
+        else Path(os.path.realpath(folder.parent)) / folder.name
+    )
 
 
 def _is_or_holds(folder: Path, other: Path) -> bool:
-    """Whether ``other`` is the folder or lies in it. Real places are compared, so that links, ``..`` and bind mounts deceive nobody."""
+    """Whether ``other`` is the folder or lies in it. Real places are compared, so that links, ``..`` and bind mounts
+    deceive nobody.
+    """
     real = Path(os.path.realpath(other))
     return any(place.exists() and place.samefile(folder) for place in (real, *real.parents))

@@ -7,8 +7,9 @@ New content grows in a hidden folder beside its place, ``.NAME.unfinished-XXXXXX
     old/    what stood in its place, while both change places
     gone/   what is being removed
 
-Folders change places in one step of the system where it has one (Linux: renameat2). Elsewhere two renames follow each other; if the
-second fails the first is undone, and if the process is killed between them, whoever reads or writes there next puts the old one back.
+Folders change places in one step of the system where it has one (Linux: renameat2). Elsewhere two renames follow each
+other; if the second fails the first is undone, and if the process is killed between them, whoever reads or writes there
+next puts the old one back.
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ _logger = logging.getLogger(__name__)
 def whole_folder(target: Target) -> Iterator[Path]:
     """A new folder to write into; it takes the target's place, with a mark, when the block ends without an error.
 
-    After an error nothing of it is left, and what was there before stands untouched. Files in an earlier folder that somebody else has
-    put there are kept beside it, with a warning.
+    After an error nothing of it is left, and what was there before stands untouched. Files in an earlier folder that
+    somebody else has put there are kept beside it, with a warning.
 
-    Raises ValueError for a target that must not be written (before the block, and again after it, for a long time may have passed), and
-    CannotWrite in one sentence when the disk is full or cannot be written.
+    Raises ValueError for a target that must not be written (before the block, and again after it, for a long time may
+    have passed), and CannotWrite in one sentence when the disk is full or cannot be written.
     """
     folder = real_place(target.folder)
     swept(settled(folder))
@@ -69,9 +70,11 @@ def whole_folder(target: Target) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
-    """A new file's path to write to; it takes the file's place when the block ends without an error. Missing folders are made.
+    """A new file's path to write to; it takes the file's place when the block ends without an error. Missing folders
+    are made.
 
-    ``durable``: also when the power fails. Pipes and devices are written as they are. Raises CannotWrite in one sentence.
+    ``durable``: also when the power fails. Pipes and devices are written as they are. Raises CannotWrite in one
+        sentence.
     """
     path = real_place(Path(path))  # "missing/.." leads somewhere though the system does not find it yet
     if path.exists() and not path.is_file() and not path.is_dir():
@@ -92,7 +95,8 @@ def whole_file(path: str | os.PathLike[str], *, durable: bool = False) -> Iterat
 
 @contextmanager
 def by_way_of_memory(path: Path) -> Iterator[str]:
-    """Where a library that does not tell of a full disk is to write a file: on Linux in memory, from where it then goes to its path.
+    """Where a library that does not tell of a full disk is to write a file: on Linux in memory, from where it then goes
+    to its path.
 
     Raises CannotWrite, and leaves nothing, when the disk takes only a part of it.
     """
@@ -113,7 +117,8 @@ def by_way_of_memory(path: Path) -> Iterator[str]:
 
 @contextmanager
 def unfinished_beside(path: Path) -> Iterator[Path]:
-    """The hidden folder beside a place that is to be written, locked by this process; gone with all in it when the block ends.
+    """The hidden folder beside a place that is to be written, locked by this process; gone with all in it when the
+    block ends.
 
     What killed processes have left of theirs for the same place is cleaned up first.
     """
@@ -129,7 +134,9 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
 
 
 def remove_folder(target: Target) -> None:
-    """Take away an earlier folder of the target's kind, if there is one, in one step. Raises as :func:`whole_folder`."""
+    """Take away an earlier folder of the target's kind, if there is one, in one step. Raises as
+    :func:`whole_folder`.
+    """
     folder = real_place(target.folder)
     swept(settled(folder))
     target.check()
@@ -147,7 +154,9 @@ def discard(folder: Path, *, foreign: list[str]) -> None:
 
 
 def settled(path: Path) -> Path:
-    """The path itself, for reading: what a kill between two renames took away is put back first, and a live swap is waited for."""
+    """The path itself, for reading: what a kill between two renames took away is put back first, and a live swap is
+    waited for.
+    """
     until = time.monotonic() + _PATIENCE_SECONDS
     while not os.path.lexists(path):
         swaps = [work for work in _unfinished(path) if (work / _OLD).exists()]
@@ -162,10 +171,16 @@ def settled(path: Path) -> Path:
 
 
 def swept(folder: Path) -> Path:
-    """The folder itself, without what killed processes have left of writings to places in it: that is put right and removed."""
+    """The folder itself, without what killed processes have left of writings to places in it: that is put right and
+    removed.
+    """
     try:
         with os.scandir(folder) as entries:
-            works = [(one.name, told[1]) for one in entries if (told := _HIDDEN.fullmatch(one.name)) and one.is_dir(follow_symlinks=False)]
+            works = [
+                (one.name, told[1])
+                for one in entries
+                if (told := _HIDDEN.fullmatch(one.name)) and one.is_dir(follow_symlinks=False)
+            ]
     except OSError:
         return folder
     for name, place in sorted(works):
@@ -174,7 +189,9 @@ def swept(folder: Path) -> Path:
 
 
 def found_below(folder: Path, pattern: str) -> list[Path]:
-    """Files and folders at or below a folder, sorted, but none that is still being written, or was when a process was killed."""
+    """Files and folders at or below a folder, sorted, but none that is still being written, or was when a process was
+    killed.
+    """
     found = sorted(Path(folder).rglob(pattern))
     return [path for path in found if not any(_HIDDEN.fullmatch(part) for part in path.relative_to(folder).parts)]
 
@@ -289,10 +306,11 @@ def _clean_up(work: Path, path: Path) -> None:
 
 
 def _mend(work: Path, path: Path) -> None:
-    """Remove a hidden folder, but nothing in it that is the last of its kind. If that fails, all stays for the next try.
+    """Remove a hidden folder, but nothing in it that is the last of its kind. If that fails, all stays for the next
+    try.
 
-    Where ``old`` and ``new`` are both there, their swap has not come to its end: the old one goes back, or beside what stands there by
-    now. Files that somebody else has put into what was replaced are kept with it.
+    Where ``old`` and ``new`` are both there, their swap has not come to its end: the old one goes back, or beside what
+    stands there by now. Files that somebody else has put into what was replaced are kept with it.
     """
     try:
         if (work / _OLD).exists() and (work / _NEW).exists():

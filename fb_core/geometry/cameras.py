@@ -14,7 +14,9 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class Pinholes:
-    """``n`` undistorted cameras that share one image size. Lengths are in scene units, focal and principal in pixels."""
+    """``n`` undistorted cameras that share one image size. Lengths are in scene units, focal and principal in
+    pixels.
+    """
 
     camera_to_world: Float[Tensor, "n 3 4"]
     """Rotation (columns: the camera's right, down and forward axes in world coordinates) and centre."""
@@ -86,7 +88,9 @@ class Pinholes:
     def pixel_centers(self) -> Float[Tensor, "h w 2"]:
         """(x, y) of every pixel centre."""
         like = {"device": self.focal.device, "dtype": self.focal.dtype}
-        y, x = torch.meshgrid(torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij"
+        )
         return torch.stack([x, y], dim=-1)
 
     def directions(self) -> Float[Tensor, "n h w 3"]:
@@ -98,7 +102,9 @@ class Pinholes:
         return F.normalize(in_world, dim=-1)
 
     def project(self, points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m"]]:
-        """Pixel coordinates and z-depth of world points; points with depth <= 0 lie behind (their pixels mean nothing)."""
+        """Pixel coordinates and z-depth of world points; points with depth <= 0 lie behind (their pixels mean
+        nothing).
+        """
         in_camera = torch.einsum("nji,nmj->nmi", self.rotations, points[None] - self.centers[:, None])
         depth = in_camera[..., 2]
         safe = torch.where(depth.abs() < 1e-12, torch.full_like(depth, 1e-12), depth)
@@ -114,7 +120,9 @@ class Pinholes:
     def scaled(self, width: int, height: int) -> Pinholes:
         """The same cameras with images resampled to another size (focal and principal scale with it)."""
         factor = self.focal.new_tensor([width / self.width, height / self.height])
-        return dataclasses.replace(self, focal=self.focal * factor, principal=self.principal * factor, width=width, height=height)
+        return dataclasses.replace(
+            self, focal=self.focal * factor, principal=self.principal * factor, width=width, height=height
+        )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Pinholes:
         """The same cameras with images cut to a window; a negative corner or a larger size pads."""
@@ -126,7 +134,9 @@ class Pinholes:
         """All cameras in one batch. Raises ValueError when the image sizes differ."""
         sizes = {(group.width, group.height) for group in groups}
         if len(sizes) != 1:
-            raise ValueError(f"cameras of one batch must share one image size, got {sorted(sizes)}; rescale or crop them first")
+            raise ValueError(
+                f"cameras of one batch must share one image size, got {sorted(sizes)}; rescale or crop them first"
+            )
         return dataclasses.replace(
             groups[0],
             camera_to_world=torch.cat([group.camera_to_world for group in groups]),
@@ -156,10 +166,15 @@ class Pinholes:
         toward = targets.double() - centers.double()
         distance = toward.norm(dim=-1, keepdim=True)
         if not bool((distance > 0).all() and torch.isfinite(distance).all()):
-            raise ValueError("looking_at: expected finite targets apart from their centers, got one at its center or not finite; move it")
+            raise ValueError(
+                "looking_at: expected finite targets apart from their centers, got one at its center or not finite; "
+                "move it"
+            )
         forward = toward / distance
         right = torch.linalg.cross(forward, F.normalize(up.double(), dim=0).expand_as(forward))
-        other = F.one_hot(forward.abs().argmin(dim=-1), 3).to(forward)  # the world axis farthest from the view direction
+        other = F.one_hot(forward.abs().argmin(dim=-1), 3).to(
+            forward
+        )  # the world axis farthest from the view direction
         parallel = right.norm(dim=-1, keepdim=True) < 1e-6
         right = F.normalize(torch.where(parallel, torch.linalg.cross(forward, other), right), dim=-1)
         down = torch.linalg.cross(forward, right)

@@ -1,7 +1,8 @@
 """Pixels of known views carried over into other views: a first guess of what these show.
 
-Every ray of an unknown view is followed to a distance, by default to infinity, and the known views are asked for the colour there. Where
-several show the place, the one that has it nearest to its own middle answers, for that one looks most the same way.
+Every ray of an unknown view is followed to a distance, by default to infinity, and the known views are asked for the
+colour there. Where several show the place, the one that has it nearest to its own middle answers, for that one looks
+most the same way.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from torch import Tensor
 from fb_core.geometry.raymap import axes_of
 
 BELIEF_BY_DIRECTION = 0.35
-"""How far to believe pixels that are carried over by direction alone, which are off where surfaces are near (what models learn)."""
+"""How far to believe pixels that are carried over by direction alone, which are off where surfaces are near (what
+models learn).
+"""
 BELIEF_OF_RENDERS = 0.7
 """How far to believe pixels whose geometry is known but for the errors of splats (what models learn)."""
 SAME_SURFACE = 0.06
@@ -64,8 +67,8 @@ def carried_over(
         known: 1 = known.
         raymaps: rays of the known views, origins in any unit.
         wanted: rays of the views to be guessed.
-        distance: how far along each of these rays the surface lies, in the unit of the origins; None = infinitely far, so that only
-            directions count.
+        distance: how far along each of these rays the surface lies, in the unit of the origins; None = infinitely far,
+            so that only directions count.
         known_distance: the same of the known views, where it is known: then what another surface hides is left out.
         same_surface: relative difference of distances up to which two views show the same surface.
     """
@@ -81,7 +84,10 @@ def carried_over(
     seen = torch.einsum("kmhwc,kcd->kmhwd", directions.expand(len(images), -1, -1, -1, -1), lens.axes)
     length = seen.norm(dim=-1).clamp(min=1e-9)
     cosine = seen[..., 2] / length
-    place = seen[..., :2] / seen[..., 2:].clamp(min=1e-9) * lens.focal[:, None, None, None] + lens.shift[:, None, None, None]
+    place = (
+        seen[..., :2] / seen[..., 2:].clamp(min=1e-9) * lens.focal[:, None, None, None]
+        + lens.shift[:, None, None, None]
+    )
     inside = (cosine > _LEAST_COSINE) & (place.abs() <= 1).all(dim=-1)
     told = torch.cat([torch.where(known >= 1, images, torch.zeros_like(images)), (known >= 1).to(images)], dim=1)
     looked_up = _sampled(told, place)
@@ -95,7 +101,9 @@ def carried_over(
     return Carried(looked_up[:, :, :3].gather(0, chosen)[0] * there, there)
 
 
-def _sampled(values: Float[Tensor, "k c h w"], place: Float[Tensor, "k m oh ow 2"], mode: str = "bilinear") -> Float[Tensor, "k m c oh ow"]:
+def _sampled(
+    values: Float[Tensor, "k c h w"], place: Float[Tensor, "k m oh ow 2"], mode: str = "bilinear"
+) -> Float[Tensor, "k m c oh ow"]:
     """Values of each known view at the places that are asked of it."""
     grid = rearrange(place, "k m h w xy -> k (m h) w xy")
     taken = F.grid_sample(values, grid, mode=mode, padding_mode="border", align_corners=False)
@@ -113,7 +121,11 @@ def _lens_of(raymaps: Float[Tensor, "k 6 h w"]) -> _Lens:
         (tangents[:, :, 0, 0], tangents[:, :, -1, 0], width),
         (tangents[:, 0, :, 1], tangents[:, -1, :, 1], height),
     ):
-        first, last, reach = first.mean(dim=1), last.mean(dim=1), 1 - 1 / pixels  # from the first pixel's centre to the last one's
+        first, last, reach = (
+            first.mean(dim=1),
+            last.mean(dim=1),
+            1 - 1 / pixels,
+        )  # from the first pixel's centre to the last one's
         focal = 2 * reach / (last - first)
         sides.append((focal, reach - focal * last))
     (focal_x, shift_x), (focal_y, shift_y) = sides

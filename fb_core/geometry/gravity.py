@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.paths import up_of
 from fb_core.geometry.similarity import Similarity, rounding_of
+from fb_core.geometry.viewpoints.paths import up_of
 
 _ONE_PLACE = 1e-6  # units of spread that count as none, beside the rounding of the coordinates
 
@@ -18,8 +18,8 @@ _ONE_PLACE = 1e-6  # units of spread that count as none, beside the rounding of 
 def upright(cameras: Sequence[Pinholes]) -> Similarity:
     """Takes cameras of any sizes to a world whose z axis is their up, of unit extent.
 
-    The turn is the smallest that does it, so headings stay as near as they can to what they were. Cameras that all stand in one place
-    keep their scale. Raises ValueError for no camera.
+    The turn is the smallest that does it, so headings stay as near as they can to what they were. Cameras that all
+    stand in one place keep their scale. Raises ValueError for no camera.
     """
     up = up_of(list(cameras)).double()
     rounding = max(rounding_of(group.centers) for group in cameras if len(group))
@@ -32,7 +32,9 @@ def upright(cameras: Sequence[Pinholes]) -> Similarity:
 
 
 def turn_between(first: Float[Tensor, " 3"], second: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes one unit vector to another; half a turn about some perpendicular axis for opposite ones."""
+    """The smallest rotation that takes one unit vector to another; half a turn about some perpendicular axis for
+    opposite ones.
+    """
     cosine = float(first @ second)
     if cosine < -1 + 1e-12:
         axis = torch.linalg.cross(first, torch.nn.functional.one_hot(first.abs().argmin(), 3).to(first))

@@ -1,4 +1,6 @@
-"""The canonical frame of views whose rays are known in part. What is unknown decides nothing: neither padding nor what stands there."""
+"""The canonical frame of views whose rays are known in part. What is unknown decides nothing: neither padding nor what
+stands there.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,12 @@ _DETERMINED = 1e-10  # mean square by which a second camera has to miss the rays
 
 
 def frame_of_known_rays(raymaps: Float[Tensor, "n 6 h w"], known: Float[Tensor, "n 1 h w"]) -> CanonicalFrame | None:
-    """The frame that fills the cube with the centres of all views that have known rays (mask above 0); None where there are none.
+    """The frame that fills the cube with the centres of all views that have known rays (mask above 0); None where there
+    are none.
 
-    It is upright in the first view whose known rays tell a camera's axes. Where none does (a row of pixels, single rays), it follows the
-    rays that there are, so that it still moves and turns with the world. Raymaps in the world, unknown rays may hold anything.
+    It is upright in the first view whose known rays tell a camera's axes. Where none does (a row of pixels, single
+    rays), it follows the rays that there are, so that it still moves and turns with the world. Raymaps in the world,
+    unknown rays may hold anything.
     """
     there = (known[:, 0] > 0).cpu()
     posed = there.flatten(1).any(dim=1).nonzero()[:, 0].tolist()
@@ -24,7 +28,9 @@ def frame_of_known_rays(raymaps: Float[Tensor, "n 6 h w"], known: Float[Tensor, 
         return None
     rays = [raymaps[view].detach().cpu()[:, there[view]] for view in posed]
     if not all(bool(torch.isfinite(one).all()) for one in rays):
-        raise ValueError("canonical frame: a known ray holds NaN or infinity; expected finite numbers, or mark the ray as unknown")
+        raise ValueError(
+            "canonical frame: a known ray holds NaN or infinity; expected finite numbers, or mark the ray as unknown"
+        )
     centers = torch.stack([one[:3].double().mean(dim=1) for one in rays]).to(raymaps.dtype)
     for place, view in enumerate(posed):
         whole = bool(there[view].all()) and min(there[view].shape) > 1
@@ -38,10 +44,12 @@ def frame_of_known_rays(raymaps: Float[Tensor, "n 6 h w"], known: Float[Tensor, 
 
 
 def axes_of_some(directions: Float[Tensor, "3 k"], there: Bool[Tensor, "h w"]) -> Float[Tensor, "3 3"] | None:
-    """Camera-to-world rotation of a pinhole camera from k of its ray directions, those of the pixels that are there, in their order.
+    """Camera-to-world rotation of a pinhole camera from k of its ray directions, those of the pixels that are there, in
+    their order.
 
-    The camera's axes are the columns of the matrix H with d ~ H (x, y, 1), which least squares finds up to its sign (the direct linear
-    transform). Exact for pinholes without skew. None where other cameras have these rays too: fewer than four, or all in one line.
+    The camera's axes are the columns of the matrix H with d ~ H (x, y, 1), which least squares finds up to its sign
+    (the direct linear transform). Exact for pinholes without skew. None where other cameras have these rays too: fewer
+    than four, or all in one line.
     """
     if directions.shape[1] < 4:
         return None
@@ -68,13 +76,16 @@ def _spread_pixels(there: Bool[Tensor, "h w"]) -> Float[Tensor, "2 k"]:
 
 
 def _axes_at_all(rays: list[Tensor], centers: Float[Tensor, "n 3"], there: Bool[Tensor, "h w"]) -> Float[Tensor, "3 3"]:
-    """Axes that turn with the world: forward is the first view's mean ray, right is told by its other rays, else by the other views."""
+    """Axes that turn with the world: forward is the first view's mean ray, right is told by its other rays, else by the
+    other views.
+    """
     first = F.normalize(rays[0][3:].double(), dim=0)
     forward = F.normalize(first.mean(dim=1), dim=0)
     pixels = _spread_pixels(there)
     along_x, along_y = ((first - forward[:, None]) @ pixels.T).unbind(dim=1)
     ahead = [F.normalize(one[3:].double(), dim=0).mean(dim=1) for one in rays]
-    # Forward takes down to minus right, so both slopes speak for the right axis; the rest only has to be the same in a turned world.
+    # Forward takes down to minus right, so both slopes speak for the right axis; the rest only has to be the same in a
+    # turned world.
     apart = centers.double() - centers[0].double()
     apart = apart / apart.abs().max().clamp(min=torch.finfo(torch.float64).tiny)
     hints = [along_x - torch.linalg.cross(forward, along_y), *apart, *ahead, *torch.eye(3, dtype=torch.float64)]

@@ -24,26 +24,30 @@ def normals_from_depth(depth: Float[Tensor, "n h w"], cameras: Pinholes) -> Floa
     """Unit normals in the camera frame (OpenCV axes) of the surface that z-depth ``depth`` (scene units) describes.
 
     The cross product of central differences of the back-projected pixel centres, (right - left) x (top - bottom). It
-    points towards the camera, however rough the depth. Where the pixel or one of its four neighbours has no depth (zero,
-    negative or not finite) the normal is zero, as it is on the border of one pixel.
-    An overall scale of the depth changes nothing.
+    points towards the camera, however rough the depth. Where the pixel or one of its four neighbours has no depth
+    (zero, negative or not finite) the normal is zero, as it is on the border of one pixel. An overall scale of the
+    depth changes nothing.
 
     Raises ValueError when depth and cameras disagree in number or size.
     """
     expected = (len(cameras), cameras.height, cameras.width)
     if tuple(depth.shape) != expected:
-        raise ValueError(f"depth: expected a shape {expected} like the cameras (number, height, width), got {tuple(depth.shape)}")
+        raise ValueError(
+            f"depth: expected a shape {expected} like the cameras (number, height, width), got {tuple(depth.shape)}"
+        )
     in_plane = (cameras.pixel_centers() - cameras.principal[:, None, None]) / cameras.focal[:, None, None]
     usable = depth.isfinite() & (depth > 0)
     filled = torch.where(usable, depth, 1.0)
     points = torch.cat([in_plane, torch.ones_like(in_plane[..., :1])], dim=-1) * filled[..., None]
     reach = filled.detach()[..., None]
-    # The length of either difference changes nothing. In units of their own depth their product stays far from underflow, however near
-    # this surface and however far another one in the picture.
+    # The length of either difference changes nothing. In units of their own depth their product stays far from
+    # underflow, however near this surface and however far another one in the picture.
     across = (points[:, 1:-1, 2:] - points[:, 1:-1, :-2]) / torch.maximum(reach[:, 1:-1, 2:], reach[:, 1:-1, :-2])
     upward = (points[:, :-2, 1:-1] - points[:, 2:, 1:-1]) / torch.maximum(reach[:, :-2, 1:-1], reach[:, 2:, 1:-1])
     normals = unit_or_zero(torch.linalg.cross(across, upward))
-    supported = usable[:, 1:-1, 1:-1] & usable[:, 1:-1, 2:] & usable[:, 1:-1, :-2] & usable[:, :-2, 1:-1] & usable[:, 2:, 1:-1]
+    supported = (
+        usable[:, 1:-1, 1:-1] & usable[:, 1:-1, 2:] & usable[:, 1:-1, :-2] & usable[:, :-2, 1:-1] & usable[:, 2:, 1:-1]
+    )
     normals = torch.where(supported[..., None], normals, 0.0)
     return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))
 

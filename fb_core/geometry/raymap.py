@@ -20,7 +20,9 @@ _SCALE_MARGIN = 1e-6  # keeps the largest origin strictly inside the cube
 
 
 def raymaps_of(cameras: Pinholes) -> Float[Tensor, "n 6 h w"]:
-    """World-space raymaps: channels 0-2 the camera centre (scene units), 3-5 the unit direction through the pixel centre."""
+    """World-space raymaps: channels 0-2 the camera centre (scene units), 3-5 the unit direction through the pixel
+    centre.
+    """
     directions = cameras.directions().permute(0, 3, 1, 2)
     origins = cameras.centers[:, :, None, None].expand_as(directions)
     return torch.cat([origins, directions], dim=1)
@@ -40,13 +42,15 @@ def from_unit_range(raymaps01: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h
 def axes_of(directions: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 3"]:
     """Camera-to-world rotation of a pinhole camera from its ray directions alone (columns: right, down, forward).
 
-    The rays of one pixel row span a plane that holds the right axis, so the normals of two rows' planes cross in it; columns give the
-    down axis. Exact for any principal point and any focal lengths without skew; needs at least 2x2 pixels.
+    The rays of one pixel row span a plane that holds the right axis, so the normals of two rows' planes cross in it;
+    columns give the down axis. Exact for any principal point and any focal lengths without skew; needs at least 2x2
+    pixels.
     """
     rays = directions.double()
     row_normals = [torch.linalg.cross(rays[:, row, 0], rays[:, row, -1]) for row in (0, -1)]
     column_normals = [torch.linalg.cross(rays[:, 0, column], rays[:, -1, column]) for column in (0, -1)]
-    # Normals of rows point down, those of columns left; crossing upper with lower (left with right) gives the axis up to its sign.
+    # Normals of rows point down, those of columns left; crossing upper with lower (left with right) gives the axis up
+    # to its sign.
     right = F.normalize(torch.linalg.cross(row_normals[0], row_normals[1]), dim=0)
     down = F.normalize(torch.linalg.cross(column_normals[0], column_normals[1]), dim=0)
     right = right * torch.sign(right @ (rays[:, 0, -1] - rays[:, 0, 0]))
@@ -63,11 +67,14 @@ def _check_reference(reference: int, count: int) -> None:
 
 
 def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Files hold rounded rotations, but only a true one makes a frame with an exact inverse. Refuses what is no rotation at all."""
+    """Files hold rounded rotations, but only a true one makes a frame with an exact inverse. Refuses what is no
+    rotation at all.
+    """
     error = float((matrix.T @ matrix - torch.eye(3, dtype=matrix.dtype)).abs().max())
     if not error < 1e-2 or float(torch.linalg.det(matrix)) < 0:
         raise ValueError(
-            f"canonical frame: the reference camera's pose is singular, mirrored or scaled, expected a rotation, got {matrix.tolist()}"
+            "canonical frame: the reference camera's pose is singular, mirrored or scaled, expected a rotation, got "
+            f"{matrix.tolist()}"
         )
     left, _, right = torch.linalg.svd(matrix)
     return left @ right
@@ -92,18 +99,25 @@ class CanonicalFrame:
             cameras: the cameras with known poses, any units.
             reference: the camera that goes to the origin, upright.
             heading_radians: rotation about the canonical z axis (training draws it, inference uses 0).
-            fill: for captures that already fit into the cube: 1 fills the cube, 0 leaves the scale alone (training draws it).
+            fill: for captures that already fit into the cube: 1 fills the cube, 0 leaves the scale alone (training
+                draws it).
         """
         _check_reference(reference, len(cameras))
         return CanonicalFrame.around(
-            cameras.rotations[reference], cameras.centers[reference], cameras.centers, heading_radians=heading_radians, fill=fill
+            cameras.rotations[reference],
+            cameras.centers[reference],
+            cameras.centers,
+            heading_radians=heading_radians,
+            fill=fill,
         )
 
     @staticmethod
     def of_raymaps(
         raymaps: Float[Tensor, "n 6 h w"], *, reference: int = 0, heading_radians: float = 0.0, fill: float = 1.0
     ) -> CanonicalFrame:
-        """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2 pixels."""
+        """The same frame from the raymaps of pinhole cameras alone; every ray must be known. Sides of at least 2
+        pixels.
+        """
         _check_reference(reference, len(raymaps))
         rotation = axes_of(raymaps[reference, 3:])
         centers = raymaps[:, :3].flatten(2).double().mean(dim=2).to(raymaps.dtype)
@@ -118,20 +132,28 @@ class CanonicalFrame:
         heading_radians: float = 0.0,
         fill: float = 1.0,
     ) -> CanonicalFrame:
-        """The frame that is upright in a camera-to-world rotation and holds all centres. In float64 on the CPU (a few numbers)."""
+        """The frame that is upright in a camera-to-world rotation and holds all centres. In float64 on the CPU (a few
+        numbers).
+        """
         axes = _nearest_rotation(rotation_camera.detach().cpu().double())
         centers = all_centers.detach().cpu().double()
         flip = axes.new_tensor([1.0, -1.0, -1.0]).diag()  # OpenCV axes to y up, z backward
-        upright = axes.new_tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # +90 degrees about x: y up -> z up
+        upright = axes.new_tensor(
+            [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+        )  # +90 degrees about x: y up -> z up
         cosine, sine = math.cos(heading_radians), math.sin(heading_radians)
         turn = axes.new_tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         rotation = turn @ upright @ flip @ axes.T
         extent = float(((centers - center.detach().cpu().double()) @ rotation.T).abs().max())
         if not math.isfinite(extent):
-            raise ValueError("canonical frame: a camera centre holds NaN or infinity; expected finite camera_to_world matrices")
+            raise ValueError(
+                "canonical frame: a camera centre holds NaN or infinity; expected finite camera_to_world matrices"
+            )
         rounding = 4 * torch.finfo(all_centers.dtype).eps * float(centers.abs().max())
         scale = extent if extent >= 1.0 else extent * fill + (1.0 - fill)
-        if scale <= rounding:  # every camera in one place, up to rounding: any scale is right, but noise must not fill the cube
+        if (
+            scale <= rounding
+        ):  # every camera in one place, up to rounding: any scale is right, but noise must not fill the cube
             scale = 1.0
         return CanonicalFrame(rotation=rotation.to(rotation_camera), center=center, scale=scale * (1.0 + _SCALE_MARGIN))
 

@@ -16,15 +16,22 @@ from torch import Tensor
 _ROWS = 49  # latitudes of the table, both poles included: 3.75 degrees apart
 _COLUMNS = 96
 _FIT_POINTS = 4096  # more points change the regression by less than its own smoothing
-_POWER = 3  # weights fall with the sixth power of the angle: local where points are dense, an average where there are none
+_POWER = (
+    3  # weights fall with the sixth power of the angle: local where points are dense, an average where there are none
+)
 _OUTLIER_QUANTILE = 0.02
-_FLAT_SHARE, _FLAT_THICKNESS = 0.04, 0.03  # a floor or ceiling: this share of all points within this part of their distance
+_FLAT_SHARE, _FLAT_THICKNESS = (
+    0.04,
+    0.03,
+)  # a floor or ceiling: this share of all points within this part of their distance
 _BISECTIONS = 24
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shell:
-    """The surface ``center + radius(direction) * direction``. Every ray from its inside leaves it (see :func:`intersect`)."""
+    """The surface ``center + radius(direction) * direction``. Every ray from its inside leaves it (see
+    :func:`intersect`).
+    """
 
     center: Float[Tensor, "3"]
     """World point that the shell is star-shaped about."""
@@ -32,7 +39,9 @@ class Shell:
     """Natural logarithm of the radius (scene units) over latitude (first row +z, last row -z) and longitude (wraps)."""
 
     def radius(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Distance from the centre to the surface along unit directions (the table's logarithms, interpolated linearly)."""
+        """Distance from the centre to the surface along unit directions (the table's logarithms, interpolated
+        linearly).
+        """
         rows, columns = self.log_radius.shape
         row = torch.acos(directions[:, 2].clamp(-1.0, 1.0)) / math.pi * (rows - 1)
         column = torch.atan2(directions[:, 1], directions[:, 0]) / (2 * math.pi) * columns
@@ -55,7 +64,9 @@ class Shell:
 def sphere(center: Float[Tensor, "3"], radius: float) -> Shell:
     """The shell of constant radius (scene units, positive)."""
     if not (math.isfinite(radius) and radius > 0):
-        raise ValueError(f"shell: radius must be a positive finite number, got {radius}; check the scale of the capture")
+        raise ValueError(
+            f"shell: radius must be a positive finite number, got {radius}; check the scale of the capture"
+        )
     return Shell(center=center, log_radius=center.new_full((_ROWS, _COLUMNS), math.log(radius)))
 
 
@@ -75,7 +86,8 @@ def fit_shell(
 
     Args:
         points: surface points in world coordinates, from any source (structure from motion, rendered depth).
-        center: the point the shell is star-shaped about; must see the scene, such as the middle of the captured cameras.
+        center: the point the shell is star-shaped about; must see the scene, such as the middle of the captured
+            cameras.
         fallback_radius: radius of the sphere that is returned when there is no usable point at all.
         up: unit direction; when given, a flat floor or ceiling among the points goes on where none was seen.
         bandwidth_degrees: angular smoothing.
@@ -91,7 +103,9 @@ def fit_shell(
         return sphere(center, fallback_radius)
     if len(distance) < fewest_points:
         return sphere(center, float(distance.median()))
-    keep = torch.linspace(0, len(distance) - 1, min(len(distance), _FIT_POINTS), device=points.device, dtype=torch.float64).long()
+    keep = torch.linspace(
+        0, len(distance) - 1, min(len(distance), _FIT_POINTS), device=points.device, dtype=torch.float64
+    ).long()
     offset, distance = offset[keep], distance[keep]
     log_distance = distance.log()
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))
@@ -103,11 +117,15 @@ def fit_shell(
     table = (weight @ log_distance) / weight.sum(dim=1)
     if up is not None:
         for axis in (up, -up):
-            table = torch.minimum(table, _log_distance_to_plane(offset @ axis, float(distance.median()), directions @ axis))
+            table = torch.minimum(
+                table, _log_distance_to_plane(offset @ axis, float(distance.median()), directions @ axis)
+            )
     return Shell(center=center, log_radius=table.reshape(_ROWS, _COLUMNS))
 
 
-def intersect(shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], *, samples: int = 48) -> Float[Tensor, "n"]:
+def intersect(
+    shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], *, samples: int = 48
+) -> Float[Tensor, "n"]:
     """Distance along each ray to where it first passes from the shell's inside to its outside.
 
     A ray that starts inside always has such a point. One that starts outside may enter first; if it never does, the
@@ -148,9 +166,11 @@ def intersect(shell: Shell, origins: Float[Tensor, "n 3"], directions: Float[Ten
 
 
 def _log_distance_to_plane(heights: Float[Tensor, "n"], typical: float, rise: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Log-distance along directions with the given rise (cosine to the axis) to the plane that the highest points lie on.
+    """Log-distance along directions with the given rise (cosine to the axis) to the plane that the highest points lie
+    on.
 
-    Infinite for directions that do not rise, and everywhere when the highest points do not lie on one plane above the centre.
+    Infinite for directions that do not rise, and everywhere when the highest points do not lie on one plane above the
+    centre.
     """
     infinite = torch.full_like(rise, torch.inf)
     top = torch.quantile(heights, 1 - _OUTLIER_QUANTILE)

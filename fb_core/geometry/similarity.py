@@ -34,13 +34,18 @@ class Similarity:
     ) -> Similarity:
         """The one that takes cameras (camera-to-world rotations, centres) of a world to the same cameras in another.
 
-        Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is the one given.
+        Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is
+        the one given.
         """
         (rotations, centers), (their_rotations, their_centers) = first, second
         if not len(centers) or not all(bool(torch.isfinite(one).all()) for pair in (first, second) for one in pair):
-            raise ValueError("similarity: expected the poses of one or more cameras, got none or one that holds NaN or infinity")
+            raise ValueError(
+                "similarity: expected the poses of one or more cameras, got none or one that holds NaN or infinity"
+            )
         rounding = rounding_of(centers)
-        rotations, centers, their_rotations, their_centers = (x.double() for x in (rotations, centers, their_rotations, their_centers))
+        rotations, centers, their_rotations, their_centers = (
+            x.double() for x in (rotations, centers, their_rotations, their_centers)
+        )
         rotation = nearest_rotations(torch.einsum("nij,nkj->ik", their_rotations, rotations)[None])[0]
         spread, their_spread = centers - centers.mean(dim=0), (their_centers - their_centers.mean(dim=0)) @ rotation
         scale = scale_of_one_place
@@ -52,7 +57,9 @@ class Similarity:
     @property
     def inverse(self) -> Similarity:
         """From the second world to the first."""
-        return Similarity(rotation=self.rotation.T, scale=1 / self.scale, shift=-(self.rotation.T @ self.shift) / self.scale)
+        return Similarity(
+            rotation=self.rotation.T, scale=1 / self.scale, shift=-(self.rotation.T @ self.shift) / self.scale
+        )
 
     def points(self, points: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
         """The same points in the other world."""

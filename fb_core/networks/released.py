@@ -1,7 +1,8 @@
 """Reader of the authors' released files: `transformer.ckpt`, `image-vae.ckpt`, `pose-vae.ckpt` in one folder.
 
-The files hold pickled dictionaries, so they are read with PyTorch's restricted unpickler: code in them is refused, never run.
-They carry no configuration; sizes are inferred from shapes, and what no shape shows (padding, groups, index embedding) is as released.
+The files hold pickled dictionaries, so they are read with PyTorch's restricted unpickler: code in them is refused,
+never run. They carry no configuration; sizes are inferred from shapes, and what no shape shows (padding, groups, index
+embedding) is as released.
 """
 
 import os
@@ -13,15 +14,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from fb_core.limits import require_model_sizes
-from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.files.limits import require_model_sizes
+from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import adopt, require_plain, without_weights
 
 TRANSFORMER_FILE = "transformer.ckpt"
 IMAGE_VAE_FILE = "image-vae.ckpt"
 RAYMAP_VAE_FILE = "pose-vae.ckpt"
-STATE_KEYS = {TRANSFORMER_FILE: "transformer_state_dict", IMAGE_VAE_FILE: "vae_state_dict", RAYMAP_VAE_FILE: "vae_state_dict"}
+STATE_KEYS = {
+    TRANSFORMER_FILE: "transformer_state_dict",
+    IMAGE_VAE_FILE: "vae_state_dict",
+    RAYMAP_VAE_FILE: "vae_state_dict",
+}
 """Where each file keeps its weights; everything else in it (optimiser, discriminator, counters) is ignored."""
 
 WRAPPERS = re.compile(r"^(module\.|model\.)+")
@@ -39,15 +44,19 @@ class Released(NamedTuple):
 def read_released(folder: str | os.PathLike[str]) -> Released:
     """Read the three released files of a folder.
 
-    Raises ValueError, in one sentence that names the file, for a missing, truncated or unsafe file and for weights of another
-    architecture (naming the keys).
+    Raises ValueError, in one sentence that names the file, for a missing, truncated or unsafe file and for weights of
+    another architecture (naming the keys).
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ValueError(f"checkpoints: expected a folder with {', '.join(STATE_KEYS)}, but there is no folder {folder}.")
+        raise ValueError(
+            f"checkpoints: expected a folder with {', '.join(STATE_KEYS)}, but there is no folder {folder}."
+        )
     missing = [name for name in STATE_KEYS if not (folder / name).is_file()]
     if missing:
-        raise ValueError(f"checkpoints: {folder} has no {' and no '.join(missing)}; all of {', '.join(STATE_KEYS)} are needed.")
+        raise ValueError(
+            f"checkpoints: {folder} has no {' and no '.join(missing)}; all of {', '.join(STATE_KEYS)} are needed."
+        )
     return Released(
         _transformer(folder / TRANSFORMER_FILE),
         _autoencoder(folder / IMAGE_VAE_FILE, padding="zeros"),
@@ -60,7 +69,9 @@ def read_state(path: Path, key: str) -> dict[str, Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
-        raise ValueError(f"{path}: refused, because it holds Python objects other than tensors, which could run code.") from error
+        raise ValueError(
+            f"{path}: refused, because it holds Python objects other than tensors, which could run code."
+        ) from error
     except Exception as error:  # a damaged pickle raises whatever it leads to
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path}: truncated, or not a PyTorch checkpoint ({reason:.200}).") from error
@@ -70,10 +81,16 @@ def read_state(path: Path, key: str) -> dict[str, Tensor]:
         raise ValueError(f"{path}: expected a dictionary with the weights under {key!r}, got {found}.")
     foreign = next((name for name in state if not isinstance(name, str)), None)
     if foreign is not None:
-        raise ValueError(f"{path}: expected names of weights, got the key {foreign!r:.40}; these are weights of another architecture.")
+        raise ValueError(
+            f"{path}: expected names of weights, got the key {foreign!r:.40}; these are weights of another "
+            "architecture."
+        )
     tensors = {WRAPPERS.sub("", name): value for name, value in state.items()}
     if len(tensors) < len(state):
-        raise ValueError(f"{path}: two of its weights have the same name but for wrappers' prefixes (module., model.); save them once.")
+        raise ValueError(
+            f"{path}: two of its weights have the same name but for wrappers' prefixes (module., model.); save them "
+            "once."
+        )
     require_plain(str(path), tensors)
     return tensors
 
@@ -116,7 +133,9 @@ def _autoencoder_config(path: Path, state: dict[str, Tensor], padding: str) -> V
         path,
         VAEConfig,
         in_channels=_shape(path, state, "encoder.conv_in.weight", 4)[1],
-        widths=tuple(_shape(path, state, f"encoder.down_blocks.{level}.resnets.0.conv1.weight", 4)[0] for level in levels),
+        widths=tuple(
+            _shape(path, state, f"encoder.down_blocks.{level}.resnets.0.conv1.weight", 4)[0] for level in levels
+        ),
         latent_channels=_shape(path, state, "post_quant_conv.weight", 4)[0],
         encoder_resnets=_count(state, r"encoder\.down_blocks\.0\.resnets\.(\d+)\."),
         decoder_resnets=_count(state, r"decoder\.up_blocks\.0\.resnets\.(\d+)\."),
@@ -136,7 +155,10 @@ def _checked(path: Path, kind: type, **sizes: Any) -> Any:
 def _shape(path: Path, state: dict[str, Tensor], name: str, dimensions: int) -> tuple[int, ...]:
     if name not in state or state[name].ndim != dimensions or 0 in state[name].shape:
         got = f"shape {list(state[name].shape)}" if name in state else "none"
-        raise ValueError(f"{path}: these are weights of another architecture (expected {name} with {dimensions} dimensions, got {got}).")
+        raise ValueError(
+            f"{path}: these are weights of another architecture (expected {name} with {dimensions} dimensions, got "
+            f"{got})."
+        )
     return tuple(state[name].shape)
 
 

@@ -1,4 +1,6 @@
-"""The CLIP text encoder of the released model (optional extra `text`); multi-view use needs the empty prompt's embedding only."""
+"""The CLIP text encoder of the released model (optional extra `text`); multi-view use needs the empty prompt's
+embedding only.
+"""
 
 import os
 from pathlib import Path
@@ -28,9 +30,14 @@ class TextEncoder:
         try:
             from transformers import CLIPTextModel, CLIPTokenizer  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise ValueError("text: prompts need the package transformers, which `pip install 'fillerbuster[text]'` installs.") from error
+            raise ValueError(
+                "text: prompts need the package transformers, which `pip install 'fillerbuster[text]'` installs."
+            ) from error
         if not Path(folder).is_dir():
-            raise ValueError(f"text: expected a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), got {folder}.")
+            raise ValueError(
+                "text: expected a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), got "
+                f"{folder}."
+            )
         try:
             tokenizer = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
             model = CLIPTextModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)

@@ -1,9 +1,10 @@
 """Decoding of large pictures in tiles, with the whole decoder's answer: no seams and no blending, only less memory.
 
-Three things let a tile see beyond its border. The mid block's attention and the coarse levels run on the whole picture, where they
-are cheap. From half resolution on, a tile carries a margin as wide as the convolutions reach, which is cut off again. And group norms
-use the statistics of the whole picture: those of the k-th norm are gathered over all tiles, given those of the k - 1 before, then the
-tiles run once more to the next norm. A decoder with group norms therefore computes its fine levels about six times, one without once.
+Three things let a tile see beyond its border. The mid block's attention and the coarse levels run on the whole picture,
+where they are cheap. From half resolution on, a tile carries a margin as wide as the convolutions reach, which is cut
+off again. And group norms use the statistics of the whole picture: those of the k-th norm are gathered over all tiles,
+given those of the k - 1 before, then the tiles run once more to the next norm. A decoder with group norms therefore
+computes its fine levels about six times, one without once.
 """
 
 import math
@@ -24,7 +25,9 @@ SMALLEST_TILE = 16
 
 
 class TiledDecoder:
-    """Stands in for `decoder` (in `VAE.decode`) and computes the same, up to rounding, in tiles of `tile` x `tile` pixels."""
+    """Stands in for `decoder` (in `VAE.decode`) and computes the same, up to rounding, in tiles of `tile` x `tile`
+    pixels.
+    """
 
     def __init__(self, decoder: Decoder, tile: int):
         if tile < SMALLEST_TILE or tile % 4:
@@ -120,7 +123,9 @@ def _windows(x: Tensor, tile: int, margin: int) -> Iterator[_Window]:
 
 
 def _span(start: int, length: int, margin: int, limit: int) -> tuple[slice, slice, slice]:
-    """Of one axis: the input with its margin, the tile within the doubled answer, and the tile within the doubled whole."""
+    """Of one axis: the input with its margin, the tile within the doubled answer, and the tile within the doubled
+    whole.
+    """
     stop = min(start + length, limit)
     first, last = max(start - margin, 0), min(stop + margin, limit)
     return slice(first, last), slice(2 * (start - first), 2 * (stop - first)), slice(2 * start, 2 * stop)
@@ -137,7 +142,9 @@ class _FixedNorm:
 
 
 class _Moments:
-    """Mean and variance of each picture's channel groups, gathered tile by tile (Chan's update, which does not cancel)."""
+    """Mean and variance of each picture's channel groups, gathered tile by tile (Chan's update, which does not
+    cancel).
+    """
 
     def __init__(self, norm: nn.GroupNorm):
         self.norm = norm

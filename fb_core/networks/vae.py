@@ -1,8 +1,9 @@
 """The two autoencoders: images and raymaps to latents at an eighth of the size, and back (paper section 3.1).
 
-One class serves both. The image autoencoder is the customary KL autoencoder of latent diffusion; the raymap autoencoder is a
-narrower one without normalisation and with replicated borders, because a raymap is smooth and its absolute values matter.
-Parameter names are those of the released checkpoints. Callers hold values in [0, 1]; that the network sees [-1, 1] is its own business.
+One class serves both. The image autoencoder is the customary KL autoencoder of latent diffusion; the raymap autoencoder
+is a narrower one without normalisation and with replicated borders, because a raymap is smooth and its absolute values
+matter. Parameter names are those of the released checkpoints. Callers hold values in [0, 1]; that the network sees [-1,
+1] is its own business.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,7 +48,9 @@ class VAEConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
         if len(self.widths) != LEVELS or not all(isinstance(width, int) and width > 0 for width in self.widths):
-            raise ValueError(f"widths: expected {LEVELS} positive channel counts (spatial factor {self.factor}), got {self.widths}.")
+            raise ValueError(
+                f"widths: expected {LEVELS} positive channel counts (spatial factor {self.factor}), got {self.widths}."
+            )
         for name in ("in_channels", "latent_channels", "encoder_resnets", "decoder_resnets", "norm_groups"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a positive integer, got {getattr(self, name)!r}.")
@@ -56,7 +59,9 @@ class VAEConfig:
         if self.padding not in ("zeros", "replicate"):
             raise ValueError(f"padding: expected 'zeros' or 'replicate', got {self.padding!r}.")
         if self.norm == "group" and any(width % self.norm_groups for width in self.widths):
-            raise ValueError(f"norm_groups: expected a divisor of every width in {self.widths}, got {self.norm_groups}.")
+            raise ValueError(
+                f"norm_groups: expected a divisor of every width in {self.widths}, got {self.norm_groups}."
+            )
         if not 0 < self.scaling < float("inf"):
             raise ValueError(f"scaling: expected a positive number, got {self.scaling}.")
 
@@ -140,9 +145,13 @@ class Upsampler(nn.Module):
 class Level(nn.Module):
     """The residual blocks of one resolution, then the step to the next resolution (none after the last)."""
 
-    def __init__(self, config: VAEConfig, channels_in: int, channels_out: int, resnets: int, step: type[nn.Module] | None):
+    def __init__(
+        self, config: VAEConfig, channels_in: int, channels_out: int, resnets: int, step: type[nn.Module] | None
+    ):
         super().__init__()
-        self.resnets = nn.ModuleList(Resnet(config, channels_in if i == 0 else channels_out, channels_out) for i in range(resnets))
+        self.resnets = nn.ModuleList(
+            Resnet(config, channels_in if i == 0 else channels_out, channels_out) for i in range(resnets)
+        )
         steps = [step(config, channels_out)] if step else []
         self.downsamplers = nn.ModuleList(steps if step is Downsampler else [])
         self.upsamplers = nn.ModuleList(steps if step is Upsampler else [])
@@ -175,7 +184,13 @@ class Encoder(nn.Module):
         widths = config.widths
         self.conv_in = _conv3x3(config, config.in_channels, widths[0])
         self.down_blocks = nn.ModuleList(
-            Level(config, widths[max(i - 1, 0)], widths[i], config.encoder_resnets, Downsampler if i < LEVELS - 1 else None)
+            Level(
+                config,
+                widths[max(i - 1, 0)],
+                widths[i],
+                config.encoder_resnets,
+                Downsampler if i < LEVELS - 1 else None,
+            )
             for i in range(LEVELS)
         )
         self.mid_block = Middle(config, widths[-1])
@@ -199,7 +214,9 @@ class Decoder(nn.Module):
         self.conv_in = _conv3x3(config, config.latent_channels, widths[0])
         self.mid_block = Middle(config, widths[0])
         self.up_blocks = nn.ModuleList(
-            Level(config, widths[max(i - 1, 0)], widths[i], config.decoder_resnets, Upsampler if i < LEVELS - 1 else None)
+            Level(
+                config, widths[max(i - 1, 0)], widths[i], config.decoder_resnets, Upsampler if i < LEVELS - 1 else None
+            )
             for i in range(LEVELS)
         )
         self.conv_norm_out = _norm(config, widths[-1])
@@ -232,7 +249,9 @@ class VAE(nn.Module):
         """Precision of the parameters."""
         return self.quant_conv.weight.dtype
 
-    def posterior(self, x01: Float[Tensor, "n c h w"]) -> tuple[Float[Tensor, "n z h//8 w//8"], Float[Tensor, "n z h//8 w//8"]]:
+    def posterior(
+        self, x01: Float[Tensor, "n c h w"]
+    ) -> tuple[Float[Tensor, "n z h//8 w//8"], Float[Tensor, "n z h//8 w//8"]]:
         """Mean and log variance of the latent, NOT scaled; training's KL term needs them.
 
         Raises ValueError unless height and width are positive multiples of 8 and the channels are the configuration's.
@@ -243,7 +262,8 @@ class VAE(nn.Module):
             raise ValueError(f"x01: expected {self.config.in_channels} channels, got {channels}.")
         if height % factor or width % factor or not height or not width:
             raise ValueError(
-                f"x01: expected height and width to be positive multiples of {factor}, got {height} x {width}; crop or resize."
+                f"x01: expected height and width to be positive multiples of {factor}, got {height} x {width}; crop "
+                "or resize."
             )
         moments = self.quant_conv(self.encoder((2 * x01 - 1).to(self.dtype)))
         mean, logvar = moments.to(x01.dtype).chunk(2, dim=1)
@@ -252,13 +272,20 @@ class VAE(nn.Module):
     def encode(
         self, x01: Float[Tensor, "n c h w"], generator: torch.Generator | Sequence[torch.Generator] | None = None
     ) -> Float[Tensor, "n z h//8 w//8"]:
-        """Scaled latents of pictures: the posterior's mean, or a sample of it when a generator is given (or one for each picture)."""
+        """Scaled latents of pictures: the posterior's mean, or a sample of it when a generator is given (or one for
+        each picture).
+        """
         mean, logvar = self.posterior(x01)
         if generator is not None:
             if isinstance(generator, torch.Generator):
-                noise = torch.randn(mean.shape, generator=generator, device=generator.device, dtype=torch.float32).to(mean)
+                noise = torch.randn(mean.shape, generator=generator, device=generator.device, dtype=torch.float32).to(
+                    mean
+                )
             else:
-                drawn = [torch.randn(mean.shape[1:], generator=one, device=one.device, dtype=torch.float32) for one in generator]
+                drawn = [
+                    torch.randn(mean.shape[1:], generator=one, device=one.device, dtype=torch.float32)
+                    for one in generator
+                ]
                 noise = torch.stack(drawn).to(mean)
             mean = mean + (0.5 * logvar).exp() * noise
         return self.config.scaling * mean
@@ -285,7 +312,9 @@ class VAE(nn.Module):
             elif isinstance(module, nn.Conv2d | nn.Linear):
                 closes_branch = name.endswith(("conv2", "to_out.0"))
                 std = 0.0 if closes_branch else module.weight[0].numel() ** -0.5
-                module.weight.copy_(torch.randn(module.weight.shape, generator=generator, device=generator.device) * std)
+                module.weight.copy_(
+                    torch.randn(module.weight.shape, generator=generator, device=generator.device) * std
+                )
                 if module.bias is not None:
                     module.bias.zero_()
         return self

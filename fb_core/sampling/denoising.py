@@ -9,17 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
-from fb_core.networks.dit import DiT
-from fb_core.networks.precision import resolved
-from fb_core.networks.prepared import Prepared
+from fb_core.machine.precision import resolved
+from fb_core.networks.transformer.dit import DiT
+from fb_core.networks.transformer.prepared import Prepared
 from fb_core.sampling.guidance import branches, guidance_map, guided
+from fb_core.sampling.integration.solvers import VelocityField
+from fb_core.sampling.integration.trajectory import OnStep, OnTrajectory, Trajectory, integrate
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.randomness import Orders
 from fb_core.sampling.reference import reference_field
-from fb_core.sampling.solvers import VelocityField
 from fb_core.sampling.starts import imposed, reference_started, started, wholly_known
 from fb_core.sampling.tiling import tiled
-from fb_core.sampling.trajectory import OnStep, OnTrajectory, Trajectory, integrate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,26 +43,38 @@ class Denoising:
     current: Float[Tensor, "n 32 h w"] | None = None
     """Latents that sampling starts from at a strength below 1."""
     counts: Float[Tensor, "n 32 h w"] | None = None
-    """1 where these count, 0 where sampling starts from noise all the same; None is 1 everywhere. What they tell in part starts in between
-    (`SamplingConfig.joins_at`). Not looked at when sampling as the original does."""
+    """1 where these count, 0 where sampling starts from noise all the same; None is 1 everywhere. What they tell in
+    part starts in between (`SamplingConfig.joins_at`). Not looked at when sampling as the original does.
+    """
     branches_at_once: int | None = None
     """Branches of guidance in one batch; None is all."""
 
     def __post_init__(self) -> None:
         if self.sampling.strength < 1 and self.current is None:
             raise ValueError(
-                f"strength: starting at time {self.sampling.strength:g} needs views to start from, got none; pass current views"
+                f"strength: starting at time {self.sampling.strength:g} needs views to start from, got none; pass "
+                "current views"
             )
 
     def run(
-        self, *, on_step: OnStep | None = None, on_trajectory: OnTrajectory | None = None, resume: Trajectory | None = None
+        self,
+        *,
+        on_step: OnStep | None = None,
+        on_trajectory: OnTrajectory | None = None,
+        resume: Trajectory | None = None,
     ) -> Float[Tensor, "n 32 h w"]:
         """Latents at t = 0."""
         solver = "euler" if self.sampling.reference_compatible else self.sampling.solver
         half = resolved(self.sampling.precision, self.noise.device) == torch.bfloat16
         with torch.autocast(self.noise.device.type, torch.bfloat16, enabled=half):
             return integrate(
-                self.field(), self.start(), self.times, solver=solver, on_step=on_step, on_trajectory=on_trajectory, resume=resume
+                self.field(),
+                self.start(),
+                self.times,
+                solver=solver,
+                on_step=on_step,
+                on_trajectory=on_trajectory,
+                resume=resume,
             )
 
     @property
@@ -106,7 +118,9 @@ class Denoising:
         text_scale = sampling.guidance_text if prompted else None
         channels = torch.stack([part.channels for part in parts])
         facts = stacked_facts(parts, self.dit.config)
-        prepared = Prepared(self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts)
+        prepared = Prepared(
+            self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts
+        )
         if sampling.reference_compatible:
             cut = {"window": sampling.window, "rounds": sampling.rounds, "orders": self.orders}
             return reference_field(prepared, scale, text_scale=text_scale, **cut)
@@ -117,7 +131,9 @@ class Denoising:
         unguided = cut_up(prepared.only(slice(1, None))) if guides and variant.is_limited else None
         field = guided(cut_up(prepared), scale, text_scale=text_scale, variant=variant, unguided=unguided)
         if sampling.known == "imposed":
-            field = imposed(field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning))
+            field = imposed(
+                field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning)
+            )
         if self.current is not None and self.counts is not None and self._from_noise_too:
             for share in self._shares:
                 told = (self.counts == share).to(self.counts)

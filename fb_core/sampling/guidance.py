@@ -1,7 +1,9 @@
-"""Classifier-free guidance with a scale per latent (paper, section 3.3: 7 where content is unknown, 1.1 where known), and its variants.
+"""Classifier-free guidance with a scale per latent (paper, section 3.3: 7 where content is unknown, 1.1 where known),
+and its variants.
 
-`guided` makes a velocity field of a prediction under several branches: (null, conditional) or the conditional alone, and last the
-conditional with a prompt. All is combined in float32, because a scale of 7 amplifies the rounding of the branches 13 times.
+`guided` makes a velocity field of a prediction under several branches: (null, conditional) or the conditional alone,
+and last the conditional with a prompt. All is combined in float32, because a scale of 7 amplifies the rounding of the
+branches 13 times.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.conditioning import LATENT_CHANNELS, Conditioning, join, split, unsplit
-from fb_core.sampling.jumps import Jumping
-from fb_core.sampling.solvers import VelocityField
+from fb_core.sampling.integration.jumps import Jumping
+from fb_core.sampling.integration.solvers import VelocityField
 from fb_core.sampling.tiling import Predict
 
 _TINY = 1e-12
@@ -27,14 +29,19 @@ class GuidanceVariant:
     """What may be done beside the paper's guidance; the defaults are the paper's."""
 
     rescale: float = 0.0
-    """Share (0 to 1) by which the guided velocity's spread is brought back to the conditional one's, per view and modality, against
-    over-saturation (Lin et al. 2024, section 3.4)."""
+    """Share (0 to 1) by which the guided velocity's spread is brought back to the conditional one's, per view and
+    modality, against over-saturation (Lin et al. 2024, section 3.4).
+    """
     optimized_scale: bool = False
-    """Scale the null velocity to fit the conditional one best before guiding away from it (CFG-Zero*, Fan et al. 2025)."""
+    """Scale the null velocity to fit the conditional one best before guiding away from it (CFG-Zero*, Fan et al.
+    2025).
+    """
     zero_init: float = 0.0
     """Share of the way, at its noisy start, on which the state stands still (CFG-Zero*: 0.04); costs no evaluation."""
     begin: float = 1.0
-    """Time (1 is noise) below which guidance acts; above it only the conditional branch is evaluated. Another distribution."""
+    """Time (1 is noise) below which guidance acts; above it only the conditional branch is evaluated. Another
+    distribution.
+    """
     end: float = 0.0
     """Time above which guidance acts (Kynkäänniemi et al. 2024)."""
 
@@ -43,7 +50,9 @@ class GuidanceVariant:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"guidance {name}: expected a share from 0 to 1, got {getattr(self, name)}")
         if not 0 <= self.end <= self.begin <= 1:
-            raise ValueError(f"guidance interval: expected 0 <= end <= begin <= 1, got end {self.end} and begin {self.begin}")
+            raise ValueError(
+                f"guidance interval: expected 0 <= end <= begin <= 1, got end {self.end} and begin {self.begin}"
+            )
 
     def acts_at(self, time: float) -> bool:
         """Whether guidance acts at a time."""
@@ -72,19 +81,25 @@ PLAIN = GuidanceVariant()
 
 
 def guidance_map(conditioning: Conditioning, *, known: float, unknown: float) -> Float[Tensor, "n 32 h w"]:
-    """Guidance scale per latent: the known scale where known, the unknown scale elsewhere, each modality by its own mask."""
+    """Guidance scale per latent: the known scale where known, the unknown scale elsewhere, each modality by its own
+    mask.
+    """
     image = unknown + (known - unknown) * conditioning.image_known
     rays = unknown + (known - unknown) * conditioning.rays_known
     return unsplit(image.expand(-1, LATENT_CHANNELS, -1, -1), rays.expand(-1, LATENT_CHANNELS, -1, -1))
 
 
 def branches(conditioning: Conditioning, null: Conditioning, scale: Float[Tensor, "n 32 h w"]) -> list[Conditioning]:
-    """What guidance has to evaluate: (null, conditional), or only the conditional branch when the scale is 1 everywhere."""
+    """What guidance has to evaluate: (null, conditional), or only the conditional branch when the scale is 1
+    everywhere.
+    """
     return [conditioning] if bool((scale == 1).all()) else [null, conditioning]
 
 
 def evaluated_by(network: Callable[[Tensor, Tensor], Tensor], parts: list[Conditioning]) -> Predict:
-    """The plain way to evaluate branches: join state and conditioning and run the network (sequence, times) on all of it, every time."""
+    """The plain way to evaluate branches: join state and conditioning and run the network (sequence, times) on all of
+    it, every time.
+    """
 
     def predict(state: Tensor, time: float, views: Tensor | None = None) -> Tensor:
         chosen = slice(None) if views is None else views
@@ -102,15 +117,17 @@ def guided(
     variant: GuidanceVariant = PLAIN,
     unguided: Predict | None = None,
 ) -> VelocityField:
-    """Classifier-free guidance v = u + scale (c - u) with a scale per latent; `predict` gives (u, c), or c alone (see `branches`).
+    """Classifier-free guidance v = u + scale (c - u) with a scale per latent; `predict` gives (u, c), or c alone (see
+    `branches`).
 
     Args:
         predict: velocities of the branches.
         scale: from `guidance_map`; it belongs to the views in their given order.
-        text_scale: with it one more branch t comes last, c with a prompt, and text_scale (t - c) is added to the image's channels.
+        text_scale: with it one more branch t comes last, c with a prompt, and text_scale (t - c) is added to the
+            image's channels.
         variant: changes to the paper's guidance.
-        unguided: evaluates what is left without the null branch (c, or c and t) where the variant's interval leaves guidance out;
-            None evaluates `predict` and ignores its null branch.
+        unguided: evaluates what is left without the null branch (c, or c and t) where the variant's interval leaves
+            guidance out; None evaluates `predict` and ignores its null branch.
     """
 
     def piece(since: float) -> VelocityField:
@@ -120,7 +137,9 @@ def guided(
         evaluated = predict if acts or unguided is None else unguided
 
         def field(state: Tensor, time: float) -> Tensor:
-            return combined(evaluated(state, time, None).float(), scale, text_scale=text_scale, variant=variant, acts=acts)
+            return combined(
+                evaluated(state, time, None).float(), scale, text_scale=text_scale, variant=variant, acts=acts
+            )
 
         return field
 
@@ -154,7 +173,9 @@ def combined(
 
 
 def _fitted(null: Tensor, conditional: Tensor) -> Tensor:
-    """The factor of the null velocity that is nearest to the conditional one, per view and modality (1 where there is no null velocity)."""
+    """The factor of the null velocity that is nearest to the conditional one, per view and modality (1 where there is
+    no null velocity).
+    """
 
     def of(pair: tuple[Tensor, Tensor]) -> Tensor:
         square = pair[0].square().sum(dim=(1, 2, 3), keepdim=True)

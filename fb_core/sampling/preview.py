@@ -10,15 +10,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.networks.vae import VAE
+from fb_core.sampling.integration.trajectory import Trajectory
 from fb_core.sampling.randomness import generator_of
-from fb_core.sampling.trajectory import Trajectory
 
 _PICTURES, _SIDE, _PATCHES = 16, 64, 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class LatentColors:
-    """The affine map from an image autoencoder's latents to the mean colours of their pixels that fits smooth pictures best."""
+    """The affine map from an image autoencoder's latents to the mean colours of their pixels that fits smooth pictures
+    best.
+    """
 
     matrix: Float[Tensor, "17 3"]
     """Weights of 16 channels, and the constant."""

@@ -38,7 +38,9 @@ def generator_of(seed: int, *places: int) -> torch.Generator:
 
 
 def noise_of(seed: int, views: int, latent_size: tuple[int, int]) -> Float[Tensor, "n 32 h w"]:
-    """Initial noise on the CPU; a view's noise depends on the seed and its place alone, not on how many views there are."""
+    """Initial noise on the CPU; a view's noise depends on the seed and its place alone, not on how many views there
+    are.
+    """
     shape = (STATE_CHANNELS, *latent_size)
     drawn = [torch.randn(shape, generator=generator_of(seed, view), dtype=torch.float32) for view in range(views)]
     return torch.stack(drawn) if drawn else torch.zeros(0, *shape, dtype=torch.float32)

@@ -1,4 +1,6 @@
-"""The original's velocity with its flaw F1, for comparisons: see `reference_compatible` in `fb_core.sampling.options.SamplingConfig`."""
+"""The original's velocity with its flaw F1, for comparisons: see `reference_compatible` in
+`fb_core.sampling.options.SamplingConfig`.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.sampling.guidance import combined
+from fb_core.sampling.integration.solvers import VelocityField
 from fb_core.sampling.randomness import Orders
-from fb_core.sampling.solvers import VelocityField
 from fb_core.sampling.tiling import Predict
 
 
@@ -21,9 +23,11 @@ def reference_field(
     rounds: int = 1,
     orders: Orders,
 ) -> VelocityField:
-    """Guidance inside tiling: predictions of views in a drawn order meet the guidance map of the views in the given order.
+    """Guidance inside tiling: predictions of views in a drawn order meet the guidance map of the views in the given
+    order.
 
-    So the two scales of the map land on arbitrary views, in every evaluation on others, also when one window holds all views.
+    So the two scales of the map land on arbitrary views, in every evaluation on others, also when one window holds all
+    views.
 
     Raises ValueError, when it is evaluated, for a window that does not divide the number of views.
     """
@@ -32,7 +36,9 @@ def reference_field(
         count = len(state)
         size = count if window is None else min(window, count)
         if count % size:
-            raise ValueError(f"window: the original needs a divisor of its {count} views, got {size}; leave reference_compatible out")
+            raise ValueError(
+                f"window: the original needs a divisor of its {count} views, got {size}; leave reference_compatible out"
+            )
         total = torch.zeros_like(state)
         for number in range(rounds):
             order = orders(time, number, count).to(state.device)

@@ -1,7 +1,8 @@
-"""MultiDiffusion over views (paper, "Raymap prediction"): more views than one sequence holds, in windows whose predictions are averaged.
+"""MultiDiffusion over views (paper, "Raymap prediction"): more views than one sequence holds, in windows whose
+predictions are averaged.
 
-Tiling sits inside guidance: it keeps the signature of a prediction, so the guidance map never leaves its views. Inside a window the index
-embedding counts the window's views, whichever they are, as it did in training.
+Tiling sits inside guidance: it keeps the signature of a prediction, so the guidance map never leaves its views. Inside
+a window the index embedding counts the window's views, whichever they are, as it did in training.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ Predict = Callable[[Float[Tensor, "n 32 h w"], float, Int[Tensor, "n"] | None], 
 
 
 def windows(count: int, size: int, *, order: Int[Tensor, "n"]) -> list[Int[Tensor, "_"]]:
-    """``order`` cut into windows of ``size`` views; the last one is filled up with the first views of the order when it would be short."""
+    """``order`` cut into windows of ``size`` views; the last one is filled up with the first views of the order when it
+    would be short.
+    """
     if count <= size:
         return [order]
     pieces = list(order.split(size))

@@ -10,11 +10,11 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from fb_core.live_bytes import LiveBytes
-from fb_core.networks.precision import resolved
-from fb_core.training.distributed import ALONE, Group, own_part
-from fb_core.training.loop import EngineConfig, Run
+from fb_core.machine.precision import resolved
+from fb_core.memory.live_bytes import LiveBytes
 from fb_core.training.recipe import Recipe, make_stage
+from fb_core.training.run.distributed import ALONE, Group, own_part
+from fb_core.training.run.loop import EngineConfig, Run
 
 _MANY = 10**9
 
@@ -34,13 +34,25 @@ class Cost:
     data_share: float
     """Share of the time in which data were made or waited for."""
     flops: float
-    """Floating-point operations of a step's matrix products, convolutions and attention, forward and backward; as executed."""
+    """Floating-point operations of a step's matrix products, convolutions and attention, forward and backward; as
+    executed.
+    """
     utilisation: float
     """These per second, over what a large matrix product reaches on this device in the same precision."""
 
 
-def measure(recipe: Recipe, stage: str, *, device: torch.device, engine: EngineConfig, seconds: float = 10.0, group: Group = ALONE) -> Cost:
-    """Train for some seconds on a pool that is only as large as a batch; the transformer's autoencoders are untrained."""
+def measure(
+    recipe: Recipe,
+    stage: str,
+    *,
+    device: torch.device,
+    engine: EngineConfig,
+    seconds: float = 10.0,
+    group: Group = ALONE,
+) -> Cost:
+    """Train for some seconds on a pool that is only as large as a batch; the transformer's autoencoders are
+    untrained.
+    """
     recipe = dataclasses.replace(
         recipe,
         pool=dataclasses.replace(recipe.pool, rooms=min(recipe.pool.rooms, recipe.dit_loss.batch)),
@@ -59,7 +71,9 @@ def measure(recipe: Recipe, stage: str, *, device: torch.device, engine: EngineC
         run.train(at_most=1)
     before = run.step, run.seconds, run.waited
     run.train(minutes=seconds / 60)
-    steps, duration, waited = (after - then for after, then in zip((run.step, run.seconds, run.waited), before, strict=True))
+    steps, duration, waited = (
+        after - then for after, then in zip((run.step, run.seconds, run.waited), before, strict=True)
+    )
     rate = steps / duration
     per_second = flops.get_total_flops() * rate
     return Cost(
@@ -78,7 +92,9 @@ def _bytes(network: nn.Module) -> int:
 
 
 def _optimizer_bytes(optimizer: torch.optim.Optimizer) -> int:
-    tensors = (value for state in optimizer.state.values() for value in state.values() if isinstance(value, torch.Tensor))
+    tensors = (
+        value for state in optimizer.state.values() for value in state.values() if isinstance(value, torch.Tensor)
+    )
     return sum(own_part(tensor).numel() * tensor.element_size() for tensor in tensors)
 
 

@@ -1,4 +1,6 @@
-"""Batches of a training, encoded once and kept in a folder, for all designs that learn from them, now or in a later run."""
+"""Batches of a training, encoded once and kept in a folder, for all designs that learn from them, now or in a later
+run.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from torch import Tensor
 
 from fb_core.conditioning import FACTOR, Conditioning
 from fb_core.files.whole import whole_file
-from fb_core.training.dit_stage import DiTStage, Encoded
+from fb_core.training.stages.dit_stage import DiTStage, Encoded
 
 
 class Kept(NamedTuple):
@@ -23,7 +25,9 @@ class Kept(NamedTuple):
     encoded: Encoded
     """Latents (in half precision on the way), what is told, and ray frames whether or not a network reads them."""
     log_distance: Float[Tensor, "b n 1 h w"] | None
-    """Mean logarithm of the distances along the rays of a latent's pixels, in units of the raymaps' origins; None if unknown."""
+    """Mean logarithm of the distances along the rays of a latent's pixels, in units of the raymaps' origins; None if
+    unknown.
+    """
 
 
 class KeptBatches:
@@ -32,11 +36,13 @@ class KeptBatches:
     def __init__(self, stage: DiTStage, folder: Path, *, count: int, data: str):
         """``stage`` draws and encodes them; its network attends in ray frames. ``count`` is how many differ.
 
-        ``data`` says what decides them beside the stage's seed, batch and task: the source and the autoencoders. Files of others in the
-        folder are left alone. Raises ValueError for a stage whose batches would have no ray frames.
+        ``data`` says what decides them beside the stage's seed, batch and task: the source and the autoencoders. Files
+        of others in the folder are left alone. Raises ValueError for a stage whose batches would have no ray frames.
         """
         if not stage.network.config.ray_frames:
-            raise ValueError("kept batches: expected a stage whose network attends in ray frames, so that they are kept, too")
+            raise ValueError(
+                "kept batches: expected a stage whose network attends in ray frames, so that they are kept, too"
+            )
         self.stage, self.folder, self.count = stage, folder, count
         name = f"{data} {stage.seed} {stage.batch} {stage.config.task} {stage.network.config.patch}"
         self._name = hashlib.sha256(name.encode()).hexdigest()[:16]
@@ -66,8 +72,15 @@ class KeptBatches:
         sequences = self.stage.sequences(number, rows)
         encoded = self.stage.encode(sequences, number, rows)
         frames = encoded.conditioning.frames
-        if encoded.image_weight is not None or encoded.rays_weight is not None or encoded.captions is not None or frames is None:
-            raise ValueError("kept batches: expected sequences with ground truth everywhere and without captions, such as rooms")
+        if (
+            encoded.image_weight is not None
+            or encoded.rays_weight is not None
+            or encoded.captions is not None
+            or frames is None
+        ):
+            raise ValueError(
+                "kept batches: expected sequences with ground truth everywhere and without captions, such as rooms"
+            )
         tensors = {"data": encoded.data.half(), "channels": encoded.conditioning.channels.half(), "frames": frames}
         if sequences.distance is not None:
             tensors["log_distance"] = log_at_latents(sequences.distance)

@@ -15,24 +15,24 @@ from torch import nn
 
 from fb_core import checkpoint
 from fb_core.conditioning import encode_frozen
-from fb_core.data.sequences import PoolConfig
-from fb_core.data.training_data import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
-from fb_core.data.training_task import Source
+from fb_core.data.training.folders import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
+from fb_core.data.training.sequences import PoolConfig
+from fb_core.data.training.task import Source
 from fb_core.files.whole import whole_file
-from fb_core.networks.dit import DiT, DiTConfig
-from fb_core.networks.precision import resolved
+from fb_core.machine.precision import resolved
 from fb_core.networks.text import WORDS, TextEncoder
+from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import Network
-from fb_core.sampler import SamplingConfig
-from fb_core.training.checkpoints import Checkpoints, read_state
-from fb_core.training.distributed import ALONE, Group
-from fb_core.training.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
-from fb_core.training.linear_start import start_linear
-from fb_core.training.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
-from fb_core.training.perceptual import load_lpips
+from fb_core.sampling import SamplingConfig
+from fb_core.training.run.checkpoints import Checkpoints, read_state
+from fb_core.training.run.distributed import ALONE, Group
+from fb_core.training.run.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
 from fb_core.training.sample_sheets import reconstruction_sheet, room_sheet
-from fb_core.training.vae_stage import VAELossConfig, VAEStage, reconstruction_error
+from fb_core.training.stages.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
+from fb_core.training.stages.linear_start import start_linear
+from fb_core.training.stages.perceptual import load_lpips
+from fb_core.training.stages.vae_stage import VAELossConfig, VAEStage, reconstruction_error
 
 STAGES = ("image-vae", "raymap-vae", "dit")
 _logger = logging.getLogger(__name__)
@@ -96,7 +96,8 @@ def run_stage(
     engine: EngineConfig | None = None,
     group: Group = ALONE,
 ) -> Run:
-    """Train one stage in ``folder/stage`` (resuming what is there). The transformer needs both autoencoders of the same folder.
+    """Train one stage in ``folder/stage`` (resuming what is there). The transformer needs both autoencoders of the same
+    folder.
 
     ``engine`` replaces the recipe's. All processes of a group call this, and see the same folder.
 
@@ -120,13 +121,16 @@ def run_stage(
 def make_stage(
     recipe: Recipe, stage: str, folder: Path | None, *, device: torch.device | str = "cpu"
 ) -> tuple[VAEStage | DiTStage, LoopConfig]:
-    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as they are born."""
+    """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as
+    they are born.
+    """
     if stage not in STAGES:
         raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")
     if stage != "dit":
         return _vae_stage(recipe, stage, device)
     image_vae, raymap_vae = (
-        _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device) for kind in STAGES[:2]
+        _new_vae(recipe, kind).to(device) if folder is None else trained_vae(recipe, kind, folder, device)
+        for kind in STAGES[:2]
     )
     encode_text = _encode_text(recipe, device, stands_in=folder is None) if recipe.dit.text_width else None
     return dit_stage(recipe, image_vae, raymap_vae, device=device, encode_text=encode_text), recipe.dit_loop
@@ -142,7 +146,9 @@ def dit_stage(
     source: Source | None = None,
     shared: SharedBatches | None = None,
 ) -> DiTStage:
-    """The transformer with fresh weights between finished autoencoders; ``source`` and ``shared`` where trainings share their data."""
+    """The transformer with fresh weights between finished autoencoders; ``source`` and ``shared`` where trainings share
+    their data.
+    """
     network = DiT(recipe.dit).initialize(torch.Generator().manual_seed(recipe.seed))
     return DiTStage(
         _begun(network, recipe, "transformer").to(device),
@@ -184,19 +190,24 @@ def _encode_text(recipe: Recipe, device: torch.device | str, *, stands_in: bool)
 def _text_encoder(recipe: Recipe, device: torch.device | str) -> TextEncoder:
     if recipe.data.text_encoder is None:
         raise ValueError(
-            f"preset {recipe.name!r} reads text: give a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), "
+            f"preset {recipe.name!r} reads text: give a folder with the CLIP text model (a clone of "
+            "openai/clip-vit-large-patch14), "
             "or choose a preset without text"
         )
     return TextEncoder.from_folder(recipe.data.text_encoder, device=device)
 
 
 def make_sheet(recipe: Recipe, task: VAEStage | DiTStage) -> OnSheet:
-    """What draws a stage's sample sheets: an unseen room, reconstructed by an autoencoder or completed by the transformer."""
+    """What draws a stage's sample sheets: an unseen room, reconstructed by an autoencoder or completed by the
+    transformer.
+    """
     family, views, size = recipe.pool.families[-1], recipe.dit_loss.task.views, recipe.pool.image_size
     if isinstance(task, VAEStage):
         return reconstruction_sheet(task.network.config, family=family, views=views, size=size, device=_device_of(task))
     vaes = {"image_vae": task.image_vae, "raymap_vae": task.raymap_vae}
-    return room_sheet(recipe.dit, **vaes, family=family, views=views, size=size, sampling=recipe.sampling, device=_device_of(task))
+    return room_sheet(
+        recipe.dit, **vaes, family=family, views=views, size=size, sampling=recipe.sampling, device=_device_of(task)
+    )
 
 
 def _device_of(task: VAEStage | DiTStage) -> torch.device:
@@ -218,7 +229,9 @@ def _vae_stage(recipe: Recipe, kind: str, device: torch.device | str) -> tuple[V
             _logger.warning("the perceptual loss is left out: no file with the weights of LPIPS's backbone was named")
     else:
         pool = multi_view_source(recipe.data, recipe.vae_pool, with_images=False, **shared)
-    return VAEStage(_new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed, perceptual=perceptual), loop
+    return VAEStage(
+        _new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed, perceptual=perceptual
+    ), loop
 
 
 def _new_vae(recipe: Recipe, kind: str) -> VAE:
@@ -260,7 +273,9 @@ def adopt_autoencoders(recipe: Recipe, folder: Path) -> None:
 
 
 def trained_vae(recipe: Recipe, kind: str, folder: Path, device: torch.device | str = "cpu") -> VAE:
-    """The averaged weights of an autoencoder stage, scaled so that its latents have unit variance (flow matching starts from N(0, 1))."""
+    """The averaged weights of an autoencoder stage, scaled so that its latents have unit variance (flow matching starts
+    from N(0, 1)).
+    """
     network, _ = _trained_vae(recipe, kind, folder)
     return network.to(device).eval().requires_grad_(False)
 
@@ -269,7 +284,9 @@ def _trained_vae(recipe: Recipe, kind: str, folder: Path) -> tuple[VAE, dict]:
     config = recipe.image_vae if kind == "image-vae" else recipe.raymap_vae
     spread = folder / kind / "spread.json"
     if not spread.exists():
-        raise ValueError(f"stage {kind!r} of preset {recipe.name!r} is not finished ({spread} is missing); train that stage first")
+        raise ValueError(
+            f"stage {kind!r} of preset {recipe.name!r} is not finished ({spread} is missing); train that stage first"
+        )
     network = VAE(dataclasses.replace(config, scaling=json.loads(spread.read_text())["scaling"]))
     return network, _load_average(network, folder / kind, recipe.name, kind)
 
@@ -325,12 +342,15 @@ def _differences(sampling: SamplingConfig) -> dict:
 def _load_average(network: nn.Module, folder: Path, preset: str, stage: str) -> dict:
     path = folder / "checkpoint.pt"
     if not path.exists():
-        raise ValueError(f"stage {stage!r} of preset {preset!r} is not trained yet ({path} is missing); train that stage first")
+        raise ValueError(
+            f"stage {stage!r} of preset {preset!r} is not trained yet ({path} is missing); train that stage first"
+        )
     state = read_state(path)
     try:
         network.load_state_dict(state["average"])
         return {"stage": stage, "steps": state["step"], "seconds": round(state["seconds"]), "losses": state["smoothed"]}
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(
-            f"{path} holds no finished stage {stage!r} of preset {preset!r} ({' '.join(str(error).split())[:200]}); train that stage again"
+            f"{path} holds no finished stage {stage!r} of preset {preset!r} ({' '.join(str(error).split())[:200]}); "
+            "train that stage again"
         ) from error

@@ -19,9 +19,9 @@ from fb_core.conditioning import encode_in_chunks
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.masks import training_mixture
-from fb_core.networks.dit import DiT, DiTConfig
+from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
-from fb_core.training.loop import OnSheet
+from fb_core.training.run.loop import OnSheet
 
 if TYPE_CHECKING:
     from fb_core.evaluation.completion import RoomViews
@@ -52,7 +52,10 @@ def room_sheet(
     def unseen_rooms() -> list[RoomViews]:
         from fb_core.evaluation.completion import unseen_room
 
-        return [unseen_room(family=family, seed=0, number=number, views=views, size=size) for number in range(_VALIDATED_ROOMS)]
+        return [
+            unseen_room(family=family, seed=0, number=number, views=views, size=size)
+            for number in range(_VALIDATED_ROOMS)
+        ]
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
         from fb_core.evaluation.ablations import conditional_validation_loss
@@ -74,7 +77,9 @@ def room_sheet(
 
 
 def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> OnSheet:
-    """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after; ``mean_error`` is over them."""
+    """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after;
+    ``mean_error`` is over them.
+    """
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
         from fb_core.evaluation.completion import unseen_room
@@ -82,7 +87,9 @@ def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: in
         network = _with_weights(VAE(config), state, device)
         room = unseen_room(family=family, seed=0, number=0, views=views, size=size)
         is_image = config.in_channels == 3
-        values = room.images if is_image else to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+        values = (
+            room.images if is_image else to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+        )
         with torch.no_grad():
             decoded = network.decode(encode_in_chunks(network, values.to(device), 16)).to(values)
         rows = {"Truth": values, "Reconstructed": decoded}
@@ -102,7 +109,9 @@ def _write(path: Path, rows: dict[str, Tensor]) -> None:
     if importlib.util.find_spec("matplotlib") is None:
         _logger.info("no %s, because matplotlib is not installed", path.name)
         return
-    from fb_core.evaluation.contact_sheet import Strip, write_contact_sheet
+    from fb_core.evaluation.figures.contact_sheet import Strip, write_contact_sheet
 
     strips = [Strip(heading=heading, pictures=list(pictures)) for heading, pictures in rows.items()]
-    write_contact_sheet(path, strips, title=f"Step {int(path.stem)}", subtitle="an unseen room, by the averaged weights", dpi=_DPI)
+    write_contact_sheet(
+        path, strips, title=f"Step {int(path.stem)}", subtitle="an unseen room, by the averaged weights", dpi=_DPI
+    )

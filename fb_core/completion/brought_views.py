@@ -1,0 +1,115 @@
+"""Generated views that a capture brings along (from ``fillerbuster complete`` or ``export``), made ready for a run's
+bank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from fb_core.completion.options import CompletionConfig
+from fb_core.completion.results.completed_views import BROUGHT, CompletedViews, Origin
+from fb_core.completion.rounds import fitted_rectangle
+from fb_core.data.capture.captures import TRUST_KEY
+from fb_core.data.capture.frames import Frame
+from fb_core.data.media import read_image, resize
+from fb_core.geometry.cameras import Pinholes
+from fb_core.masks import wholly_known
+
+
+def takes_brought(config: CompletionConfig) -> bool:
+    """Whether a run trains on such views at all; one that inpaints captured pictures has no use for others."""
+    return config.enabled and config.task == "new-views" and config.on_completed_capture != "ignore"
+
+
+def announcement_of_brought(count: int, config: CompletionConfig) -> str:
+    """One sentence on what becomes of them."""
+    told = f"The capture brings {count} generated view{'' if count == 1 else 's'} along"
+    if not takes_brought(config):
+        return f"{told}: left out, only its photos count."
+    also = (
+        "others are generated beside them"
+        if config.on_completed_capture == "extend"
+        else "none are generated beside them"
+    )
+    return (
+        f"{told}: trained on as such from step {config.at_step} on, never as photos; {also} "
+        "(completion.on_completed_capture)."
+    )
+
+
+def brought_views(frames: Sequence[Frame], *, number: int, size: int | None = None) -> CompletedViews:
+    """The frames as one round of square views.
+
+    Args:
+        frames: at least one, with cameras in the world of the splats.
+        number: of the round.
+        size: side of the views in pixels; None is the longest side of any frame. Frames of that size stay as they are,
+            others are scaled, and padded with pixels that are not trained on.
+
+    Raises ValueError in one sentence for a picture that cannot be read.
+    """
+    loaded = [frame.load_undistorted() for frame in frames]
+    side = size or max(max(image.shape[1:]) for image, _, _ in loaded)
+    pictures, cameras = zip(
+        *(_fitted(torch.cat([image, mask]), camera, side) for image, mask, camera in loaded), strict=True
+    )
+    views = torch.stack(pictures)
+    trusts = [_trust(frame, side) for frame in frames]
+    return CompletedViews(
+        images=rearrange((views[:, :3].clamp(0, 1) * 255).round().to(torch.uint8), "n c h w -> n h w c").contiguous(),
+        masks=rearrange(views[:, 3:] > 0, "n 1 h w -> n h w 1").contiguous(),
+        cameras=Pinholes.cat(list(cameras)),
+        origins=tuple(_origin(frame, number) for frame in frames),
+        trust=None
+        if all(told is None for told, _ in trusts)
+        else torch.stack([whole if told is None else told for told, whole in trusts]),
+    )
+
+
+def _fitted(
+    picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int
+) -> tuple[Float[Tensor, "4 side side"], Pinholes]:
+    """Colours and mask in the middle of a square; the mask is 0 around them."""
+    left, top, width, height = fitted_rectangle(camera.height, camera.width, side)
+    pads = (left, side - width - left, top, side - height - top)
+    fitted = torch.cat(wholly_known(picture[:3], picture[3:], lambda channels: resize(channels, height, width)))
+    return F.pad(fitted, pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
+
+
+def _trust(frame: Frame, side: int) -> tuple[UInt8[Tensor, "side side 1"] | None, UInt8[Tensor, "side side 1"]]:
+    """The trust of each pixel where the frame names a picture of it that can be read, and that of the whole view."""
+    whole = torch.full((side, side, 1), round(255 * _origin(frame, 0).trust), dtype=torch.uint8)
+    told = frame.extra.get(TRUST_KEY)
+    root = frame.image_path.parent.parent
+    if (
+        not isinstance(told, str)
+        or not (root / told).resolve().is_relative_to(root.resolve())
+        or not (root / told).is_file()
+    ):
+        return None, whole
+    picture = read_image(root / told)[:1]
+    left, top, width, height = fitted_rectangle(picture.shape[1], picture.shape[2], side)
+    pads = (left, side - width - left, top, side - height - top)
+    fitted = F.pad(resize(picture, height, width).clamp(0, 1), pads)
+    return (fitted * 255).round().to(torch.uint8).movedim(0, -1).contiguous(), whole
+
+
+def _origin(frame: Frame, number: int) -> Origin:
+    """What the frame says of its own origin, as far as it does."""
+    told = frame.extra
+    seed, aspect, trust = told.get("seed"), told.get("aspect"), told.get("trust")
+    return Origin(
+        role=BROUGHT,
+        round=number,
+        seed=seed if isinstance(seed, int) else 0,
+        prompt=str(told.get("prompt") or ""),
+        model_hash=str(told.get("model_hash") or ""),
+        aspect=float(aspect) if isinstance(aspect, int | float) else frame.camera.width / frame.camera.height,
+        trust=float(trust) if isinstance(trust, int | float) and 0 <= trust <= 1 else 1.0,
+    )

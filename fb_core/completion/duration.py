@@ -1,0 +1,128 @@
+"""About how long a completion takes on a machine, before it starts: counted products over the rate that the machine
+reaches in one.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import lru_cache
+
+import torch
+
+from fb_core.checkpoint import ModelConfig
+from fb_core.inpainter import Fillerbuster
+from fb_core.memory.budget import GIB, SIDE_MULTIPLE
+from fb_core.networks.vae import VAE, VAEConfig
+from fb_core.networks.weights import without_weights
+from fb_core.sampling.options import SamplingConfig
+
+_OVERHEAD = 2.2  # a step takes so many times what its products alone would take (docs/speed_and_accuracy.md)
+_TRIAL_SECONDS = 0.05
+
+
+def expected_seconds(
+    model: Fillerbuster, *, views: int, known: int, side: int, sampling: SamplingConfig, recovers_rays: bool = False
+) -> float:
+    """:func:`seconds_of` a model that is loaded; where it stands decides the machine."""
+    return seconds_of(
+        model.config,
+        model.device,
+        model.dit.dtype,
+        views=views,
+        known=known,
+        side=side,
+        sampling=sampling,
+        recovers_rays=recovers_rays,
+    )
+
+
+def seconds_of(
+    model: ModelConfig,
+    device: torch.device,
+    dtype: torch.dtype,
+    *,
+    views: int,
+    known: int,
+    side: int,
+    sampling: SamplingConfig,
+    recovers_rays: bool = False,
+) -> float:
+    """Seconds that completing square views takes, right within a factor of two or so; no weights are needed to tell.
+
+    Args:
+        model: the networks' architecture.
+        device: where they run.
+        dtype: the transformer's precision.
+        views: of the sequence.
+        known: of them have a picture.
+        side: of the views in pixels.
+        sampling: steps, window and rounds.
+        recovers_rays: raymaps are decoded instead of pictures.
+    """
+    size = -(-side // SIDE_MULTIPLE) * SIDE_MULTIPLE
+    config = model.transformer
+    tokens = (size // (model.image_vae.factor * config.patch)) ** 2
+    window = min(sampling.window or views, views)
+    passes = sampling.steps * (sampling.rounds * -(-views // window) if window < views else 1)
+    branches = 1 if sampling.guidance_known == sampling.guidance_unknown == 1 else 2
+    per_token = (
+        2 * (4 + 2 * config.mlp_ratio) * config.width**2 + 4 * config.width * tokens * window
+    )  # projections; attention
+    a_pass = config.depth * per_token * tokens * window
+    encoded = views * (_flops(model.image_vae, size)[0] + _flops(model.raymap_vae, size)[0])
+    decoded = (views if recovers_rays else views - known) * _flops(
+        model.raymap_vae if recovers_rays else model.image_vae, size
+    )[1]
+    rate = _rate(str(device), dtype)
+    return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
+
+
+def seconds_of_products(products: float, device: str = "cpu") -> float:
+    """Seconds of work that takes as long as so many floating-point operations of large products."""
+    return products / _rate(device, torch.float32)
+
+
+def in_words(seconds: float, memory: int | None = None) -> str:
+    """What is expected, in round numbers, such as ``about 40 s, up to 0.6 GiB of memory``; without the memory where it
+    is not given.
+    """
+    takes = (
+        f"{max(1, seconds):.0f} s"
+        if seconds < 90
+        else f"{seconds / 60:.0f} min"
+        if seconds < 5400
+        else f"{seconds / 3600:.1f} h"
+    )
+    return f"about {takes}" + ("" if memory is None else f", up to {max(memory / GIB, 0.1):.1f} GiB of memory")
+
+
+@lru_cache(maxsize=8)
+@torch.no_grad()
+def _flops(config: VAEConfig, size: int) -> tuple[int, int]:
+    """Of encoding and of decoding one view."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    vae = without_weights(lambda: VAE(config))
+    counts = []
+    latent = size // config.factor
+    for run, shape in (
+        (vae.encode, (1, config.in_channels, size, size)),
+        (vae.decode, (1, config.latent_channels, latent, latent)),
+    ):
+        with FlopCounterMode(display=False) as counter:
+            run(torch.empty(shape, device="meta"))
+        counts.append(counter.get_total_flops())
+    return counts[0], counts[1]
+
+
+@lru_cache(maxsize=4)
+def _rate(device: str, dtype: torch.dtype) -> float:
+    """Floating-point operations per second of a large product, the best of a few."""
+    left, right = (torch.ones(512, 512, device=device, dtype=dtype) for _ in range(2))
+    best, began = float("inf"), time.perf_counter()
+    while best == float("inf") or time.perf_counter() - began < _TRIAL_SECONDS:
+        start = time.perf_counter()
+        product = left @ right
+        float(product[0, 0])  # waits for a GPU
+        best = min(best, time.perf_counter() - start)
+    return 2 * 512**3 / best

@@ -1,0 +1,295 @@
+"""Running a completion (paper, section 3.2): generate the planned views round by round.
+
+Anchors are conditioned on the capture, densified views on the capture and the anchors. Nothing here knows nerfstudio.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from fb_core.completion.duration import in_words
+from fb_core.completion.options import CompletionConfig, PlacementConfig
+from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, plan_completion
+from fb_core.completion.results.cache import CompletionCache, round_key
+from fb_core.completion.results.completed_views import ANCHOR, CompletedViews, Origin
+from fb_core.data.media import resize
+from fb_core.geometry.cameras import Pinholes
+from fb_core.inpainter import SamplingConfig
+from fb_core.masks import wholly_known
+from fb_core.views import Views
+
+__all__ = [
+    "CapturedView",
+    "CompletedViews",
+    "CompletionConfig",
+    "CompletionPlan",
+    "Inpainter",
+    "PlacementConfig",
+    "announcement",
+    "fitted_view",
+    "plan_completion",
+    "run_completion",
+]
+
+
+@runtime_checkable
+class Inpainter(Protocol):
+    """What a round needs of ``fb_core.inpainter.Fillerbuster``."""
+
+    model_hash: str
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def recommended_sampling(self) -> SamplingConfig: ...
+
+    def complete(
+        self,
+        views: Views,
+        *,
+        generator: torch.Generator,
+        sampling: SamplingConfig,
+        on_step: Callable[[int, int], None] | None,
+        prompt: str | None = None,
+        current: Views | None = None,
+    ) -> Views: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class CapturedView:
+    """One captured picture with its camera, as far as it is known."""
+
+    image: Float[Tensor, "3 h w"]
+    """RGB in [0, 1]."""
+    known: Float[Tensor, "1 h w"]
+    """1 where the pixel is given."""
+    camera: Pinholes
+    """One camera of the picture's size."""
+
+
+def run_completion(
+    plan: CompletionPlan,
+    context: Sequence[CapturedView],
+    model: Inpainter,
+    config: CompletionConfig,
+    *,
+    done: CompletedViews | None = None,
+    first_guess: Callable[[Pinholes], Views | None] | None = None,
+    on_step: Callable[[PlannedRound, int, int], None] | None = None,
+    on_found: Callable[[PlannedRound], None] | None = None,
+) -> Iterator[CompletedViews]:
+    """Generate the planned rounds one after the other; yields the new views of each.
+
+    Every round sees the context views (fitted to the model's size) and, if it is no anchor round, all anchors. The same
+    plan, context, model and options give the same views whatever happened before: each round has its own seed. With
+    ``config.cache_dir`` a round that was ever generated from the same inputs is loaded instead.
+
+    Args:
+        plan: what to generate.
+        context: the captured views ``plan.context``, in that order.
+        model: the diffusion model.
+        config: sampling options.
+        done: views of rounds that an interrupted run has generated; these rounds are skipped.
+        first_guess: gives what new cameras see as far as that is known; generation starts from there at
+            ``config.strength``, or is told of it, as ``config.guess`` says.
+        on_step: called with (round, denoising steps done, steps in all).
+        on_found: called with a round that is loaded from the cache.
+
+    Raises ValueError when the cache's folder is a file, and as the model does.
+    """
+    cache = open_cache(config)
+    fitted = Views.cat([fitted_view(view, plan.size) for view in context])
+    finished = [] if done is None else done.rounds
+    anchors = (
+        None if done is None else _as_views(done[[i for i, origin in enumerate(done.origins) if origin.role == ANCHOR]])
+    )
+    ignored = config.strength == 1 and config.sampling(model.recommended_sampling).guess == "start"
+    for planned in plan.rounds:
+        if planned.number in finished:
+            continue
+        captured = fitted[list(plan.context_of(planned))]
+        known = [captured] if planned.role == ANCHOR or anchors is None else [captured, anchors]
+        sequence = Views.cat([*known, Views.unknown(planned.cameras)])
+        guess = None if ignored or first_guess is None else first_guess(planned.cameras)
+        current = None if guess is None else Views.cat([*known, guess])
+        images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
+        origin = Origin(
+            role=planned.role,
+            round=planned.number,
+            seed=planned.seed,
+            prompt=planned.prompt,
+            model_hash=model.model_hash,
+            aspect=planned.aspect,
+        )
+        views = CompletedViews(
+            images=images,
+            masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),
+            cameras=planned.cameras,
+            origins=(origin,) * len(planned.cameras),
+        )
+        if planned.role == ANCHOR:
+            anchors = _as_views(views)
+        yield views
+
+
+def open_cache(config: CompletionConfig) -> CompletionCache | None:
+    """The cache that is asked for. Raises ValueError when its folder is a file."""
+    return None if config.cache_dir is None else CompletionCache(config.cache_dir)
+
+
+def round_images(
+    sequence: Views,
+    planned: PlannedRound,
+    model: Inpainter,
+    config: CompletionConfig,
+    cache: CompletionCache | None,
+    on_step: Callable[[PlannedRound, int, int], None] | None,
+    on_found: Callable[[PlannedRound], None] | None,
+    current: Views | None = None,
+) -> UInt8[Tensor, "n h w 3"]:
+    """Pictures of the sequence's last views, those of the round: from the cache, or generated (from ``current``) and
+    kept there.
+    """
+    sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
+    if current is not None:
+        sampling = dataclasses.replace(sampling, strength=config.strength)
+    key = ""
+    if cache is not None:
+        key = round_key(
+            sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt, current=current
+        )
+    found = None if cache is None else cache.find(key, views=views, size=sequence.size[0])
+    if found is not None:
+        if on_found is not None:
+            on_found(planned)
+        return found
+    optional: dict[str, Any] = ({"prompt": prompt} if prompt else {}) | (
+        {} if current is None else {"current": current}
+    )
+    filled = model.complete(
+        sequence,
+        generator=torch.Generator().manual_seed(planned.seed),
+        sampling=sampling,
+        on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
+        **optional,
+    )
+    new = filled[list(range(len(sequence) - views, len(sequence)))]
+    images = in_8_bits(new.images)
+    if cache is not None:
+        cache.keep(key, images)
+    return images
+
+
+def in_8_bits(images: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w 3"]:
+    """Pictures as the bank and the cache hold them."""
+    return (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
+
+
+def fitted_view(view: CapturedView, size: int) -> Views:
+    """A captured view at the model's size: the long side scaled to ``size``, the short side padded with unknown pixels.
+
+    The camera follows exactly (a padded picture sees more to both sides). Unknown pixels neither bleed into known ones
+    nor matter; a resampled pixel is known when all that it was made from is known.
+    """
+    _, height, width = view.image.shape
+    left, top, new_width, new_height = fitted_rectangle(height, width, size)
+    image, known = wholly_known(view.image, view.known, lambda channels: resize(channels, new_height, new_width))
+    pads = (left, size - new_width - left, top, size - new_height - top)
+    camera = view.camera.scaled(new_width, new_height).cropped(-left, -top, size, size)
+    return Views.known(F.pad(image, pads)[None], camera, mask=F.pad(known, pads)[None])
+
+
+def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, int, int]:
+    """Where in a square a picture stands whose long side is scaled to the square's: left, top, width, height in
+    pixels.
+    """
+    scale = size / max(height, width)
+    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
+    return (size - new_width) // 2, (size - new_height) // 2, new_width, new_height
+
+
+def announcement(
+    plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None
+) -> str:
+    """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left; two where the
+    capture decides.
+    """
+    if plan.covered is not None and not plan.rounds:
+        if plan.covered[1] > plan.covered[0]:
+            return "The splats show all that new views would show already, so no view is generated."
+        return f"The capture shows {plan.covered[0]:.0%} of what surrounds it, so no view is generated."
+    context = max(len(plan.context_of(one)) for one in plan.rounds)
+    asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
+    left = [one for one in plan.rounds if done is None or one.number not in done.rounds]
+    sequences = [
+        (len(plan.context_of(one)) + (0 if one.role == ANCHOR else _anchors(plan)), len(one.cameras)) for one in left
+    ]
+    there = "" if done is None else f"; {len(done)} of these views are there already"
+    along = "" if config.camera_path is None else f" along {config.camera_path.name}"
+    sequence = context + max(len(one.cameras) + (0 if one.role == ANCHOR else _anchors(plan)) for one in plan.rounds)
+    passes = (
+        f"{len(plan.rounds)} passes of {config.sampling(model.recommended_sampling).steps} steps over up to "
+        f"{sequence} views"
+    )
+    decided = ""
+    if plan.covered is not None:
+        decided = (
+            f"The capture shows {plan.covered[0]:.0%} of what surrounds it, with the new views {plan.covered[1]:.0%}. "
+        )
+    return decided + (
+        f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
+        f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {passes}, "
+        f"conditioned on {context} of {plan.captured} captured "
+        f"views{asked}{there}{expectation(sequences, plan.size, config, model)}."
+    )
+
+
+def expectation(sequences: Sequence[tuple[int, int]], size: int, config: CompletionConfig, model: Inpainter) -> str:
+    """What sequences of (known, generated) views will take, as far as the model can tell; for example ``; about 40 s,
+    0.6 GiB``.
+    """
+    expected = getattr(model, "expected", None)
+    if expected is None or not sequences:
+        return ""
+    sampling, prompted = config.sampling(model.recommended_sampling), bool(config.prompt)
+    each = [
+        expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted)
+        for known, generated in sequences
+    ]
+    seconds, most = sum(one[0] for one in each), max(one[1] for one in each)
+    return f"; {in_words(seconds, most)}"
+
+
+def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:
+    """True in the largest rectangle of an aspect (width over height) in the middle of a square."""
+    left, top, width, height = fitted_rectangle(*((1.0, aspect) if aspect > 1 else (1 / aspect, 1.0)), size)
+    mask = torch.zeros(1, size, size, 1, dtype=torch.bool)
+    mask[:, top : top + height, left : left + width] = True
+    return mask
+
+
+def model_name(config: CompletionConfig, model: Inpainter) -> str:
+    """What a person calls the model."""
+    own = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
+    return getattr(model, "name", own)
+
+
+def _anchors(plan: CompletionPlan) -> int:
+    return sum(len(one.cameras) for one in plan.rounds if one.role == ANCHOR)
+
+
+def _as_views(views: CompletedViews) -> Views | None:
+    """Generated views as known ones for the next round."""
+    if len(views) == 0:
+        return None
+    return Views.known(views.images.permute(0, 3, 1, 2).float() / 255, views.cameras)

@@ -1,0 +1,139 @@
+"""Training sequences from meshes: views on a sphere around any file that trimesh reads (paper, appendix
+"Shutterstock3D").
+
+Our triangle caster draws them, on the training's device, with the mesh's own colours or texture under soft light;
+pyvista can draw them instead, which knows more materials.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+
+from fb_core.data.meshes.mesh_pictures import Lighting, draw_with_caster, draw_with_pyvista, read_mesh
+from fb_core.data.training.sequences import Encode, Rendered, ViewPool
+from fb_core.files.whole import found_below
+from fb_core.geometry.cameras import Pinholes
+from fb_core.sampling.randomness import generator_of
+
+_logger = logging.getLogger(__name__)
+_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf", ".dae", ".zae")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshConfig:
+    """How meshes become sequences."""
+
+    image_size: int = 256
+    """Side of the square views in pixels."""
+    views: int = 24
+    """Views per mesh, all over a sphere (paper: 24)."""
+    meshes: int = 64
+    """Rendered meshes at hand."""
+    renewed_per_step: float = 0.25
+    """Meshes replaced per training step."""
+    fov_degrees: float = 50.0
+    """Field of view of the cameras."""
+    distance: tuple[float, float] = (2.6, 3.4)
+    """Range of the cameras' distance from the middle, in radii of the mesh."""
+    supersample: int = 2
+    """Rays per pixel side."""
+    renderer: Literal["caster", "pyvista"] = "caster"
+    """Who draws."""
+    retries: int = 8
+    """Files tried, one after the other, before an unreadable mesh ends the training."""
+
+    def __post_init__(self) -> None:
+        if (
+            self.image_size % 16
+            or min(self.views, self.meshes, self.supersample, self.retries) < 1
+            or self.distance[0] <= 1.0
+        ):
+            raise ValueError(
+                "meshes: expected an image size divisible by 16, counts of at least 1 and distances above 1, got "
+                f"{self}"
+            )
+
+
+class MeshPool(ViewPool):
+    """Meshes seen from all over a sphere, renewed step by step."""
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        config: MeshConfig,
+        *,
+        seed: int,
+        device: torch.device | str = "cpu",
+        encode: Encode | None = None,
+        with_images: bool = True,
+    ):
+        super().__init__(
+            config.meshes,
+            config.views,
+            config.image_size,
+            config.renewed_per_step,
+            device=device,
+            encode=encode,
+            with_images=with_images,
+        )
+        self.files, self.config, self.seed = tuple(files), config, seed
+        if not files:
+            raise ValueError("meshes: expected at least one file, got none")
+
+    def render(self, numbers: list[int]) -> list[Rendered]:
+        """A random file for each number; one that cannot be read is told in the log and another is drawn."""
+        return [self._render(number) for number in numbers]
+
+    def _render(self, number: int) -> Rendered:
+        generator = generator_of(self.seed, number)
+        cameras = sphere_cameras(self.config, generator)
+        if not self.with_images:
+            return Rendered(cameras)
+        draw = draw_with_pyvista if self.config.renderer == "pyvista" else draw_with_caster
+        background, lamp = torch.rand(3, generator=generator), F.normalize(torch.randn(3, generator=generator), dim=0)
+        light = Lighting(background=tuple(background.tolist()), lamp=tuple(lamp.tolist()))
+        error: Exception | None = None
+        for _ in range(self.config.retries):
+            path = self.files[int(torch.randint(len(self.files), (), generator=generator))]
+            try:
+                return Rendered(
+                    cameras, draw(read_mesh(path), cameras.to(self.device), light, supersample=self.config.supersample)
+                )
+            except (
+                Exception
+            ) as found:  # of trimesh and of what its materials hold: whatever it is, another file is drawn
+                told = found if isinstance(found, ValueError) else f"{path}: {type(found).__name__}: {found}"
+                _logger.warning("left out a mesh: %s", told)
+                error = found
+        raise ValueError(
+            f"meshes: {self.config.retries} files in a row could not be drawn, the last because: {error}"
+        ) from error
+
+
+def find_meshes(folder: Path) -> list[Path]:
+    """Every mesh file at or below a folder, sorted. Raises ValueError if there is none."""
+    found = (
+        [path for path in found_below(folder, "*") if path.suffix.lower() in _SUFFIXES] if Path(folder).is_dir() else []
+    )
+    if not found:
+        raise ValueError(
+            f"meshes: expected files of {', '.join(_SUFFIXES)} at or below {folder}, found none; check the path"
+        )
+    return found
+
+
+def sphere_cameras(config: MeshConfig, generator: torch.Generator) -> Pinholes:
+    """Upright cameras all over a sphere that look at its middle, where the mesh has radius 1."""
+    ways = F.normalize(torch.randn(config.views, 3, generator=generator), dim=-1)
+    near, far = config.distance
+    distances = near + (far - near) * torch.rand(config.views, 1, generator=generator)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    size, middle = config.image_size, torch.zeros(config.views, 3)
+    return Pinholes.looking_at(ways * distances, middle, up=up, fov_degrees=config.fov_degrees, width=size, height=size)

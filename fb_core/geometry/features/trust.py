@@ -1,0 +1,186 @@
+"""Which cameras from features deserve trust: what their observations determine, and whether all matches agree with
+them.
+
+A bundle adjustment gives every camera a place, also where nothing fixes it: behind a weak link, along the axis of a
+lens whose focal length is not known, before a plane. Its normal equations say how well each camera is determined
+against the others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fb_core.geometry.features.bundle_adjustment import Bundle, Equations, Lenses
+
+_PESSIMISM = 3.0  # observations err together (the same tracks, the same lens), which their scatter does not tell
+_LEAST_SIGMA = 0.1  # tolerances; places of features are no better
+_MOST_TURN_DEGREES, _MOST_SHIFT = (
+    1.0,
+    0.05,
+)  # deviations of a camera that is not doubtful; shifts in distances of the farthest camera
+_MOST_FOCAL = 0.05  # relative deviation of a focal length that is not named as the reason
+_ON_THE_LINE, _LEAST_AGREEING = 2.0, 0.6  # tolerances; share of the matches
+_EXACT = 1e12  # inverse variance of what is known
+_DROPPED = 0.1  # share of the cameras that leave the reference at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviations:
+    """How far cameras may be off, as standard deviations against those that fix each other best."""
+
+    turn_degrees: Float[np.ndarray, " n"]
+    shift: Float[np.ndarray, " n"]
+    """In distances of the reference's farthest camera from its middle."""
+    focal: Float[np.ndarray, " l"]
+    """Of the focal lengths, relative."""
+    lens: Int[np.ndarray, " n"]
+    """Of each camera."""
+    sound: Bool[np.ndarray, " n"]
+    """Cameras whose deviations are small enough."""
+
+
+def deviations_of(bundle: Bundle, lenses: Lenses) -> Deviations:
+    """Of an adjusted bundle. What `lenses` says of focal lengths counts as a measurement; what is not free in it is
+    taken as exact.
+    """
+    count = len(bundle.rotations)
+    reduced = Equations.of(bundle, lenses).reduced()[0]
+    relative = np.linalg.norm(bundle.misses(), axis=1) / bundle.tolerance
+    sigma = (
+        max(_LEAST_SIGMA, float(np.median(relative)) / 1.177) * _PESSIMISM
+    )  # 1.177: median of Rayleigh's distribution
+    centers = -np.einsum("nji,nj->ni", bundle.rotations, bundle.shifts)
+    to_world = _to_world(bundle)
+    within = np.diag(
+        np.concatenate([np.zeros(6 * count), np.where(lenses.free, lenses.precisions(bundle), 1.0).ravel()])
+    )
+    told = np.diag(
+        np.concatenate([np.zeros(6 * count), np.where(lenses.free, lenses.precisions(bundle), _EXACT).ravel()])
+    )
+    gauge = _gauge(centers, len(reduced))
+    information = (reduced - within) / sigma**2 + told  # sigma is that of observations, not of what was told
+    own = to_world @ information @ to_world.T
+    directions = np.linalg.qr(gauge)[0]
+    covariance = np.linalg.inv(
+        (own + own.T) / 2 + np.trace(information[: 6 * count, : 6 * count]) / count * directions @ directions.T
+    )
+    return _against_the_best(covariance, gauge, centers, bundle.lens)
+
+
+def _to_world(bundle: Bundle) -> Float[np.ndarray, "d d"]:
+    """Orthogonal, from changes in camera axes to those in the world: R' = exp(w) R is turned by -R^T w, and a shift s
+    moves by -R^T s.
+    """
+    count, lenses = len(bundle.rotations), 3 * len(bundle.focal)
+    result = np.eye(6 * count + lenses)
+    for index, rotation in enumerate(bundle.rotations):
+        for part in (0, 3):
+            rows = slice(6 * index + part, 6 * index + part + 3)
+            result[rows, rows] = -rotation.T
+    return result
+
+
+def _gauge(centers: Float[np.ndarray, "n 3"], width: int) -> Float[np.ndarray, "d 7"]:
+    """What turning, shifting and scaling the world does to turns and places of its cameras."""
+    count = len(centers)
+    arms = centers - centers.mean(axis=0)
+    result = np.zeros((width, 7))
+    for index in range(count):
+        x, y, z = arms[index]
+        result[6 * index : 6 * index + 3, :3] = np.eye(3)
+        result[6 * index + 3 : 6 * index + 6, :3] = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # w x arm
+        result[6 * index + 3 : 6 * index + 6, 3:6] = np.eye(3)
+        result[6 * index + 3 : 6 * index + 6, 6] = arms[index]
+    return result
+
+
+def _against_the_best(
+    covariance: np.ndarray, gauge: np.ndarray, centers: Float[np.ndarray, "n 3"], lens: np.ndarray
+) -> Deviations:
+    """Deviations once the world is tied to the cameras that fix each other, found by leaving out the worst again and
+    again.
+    """
+    chosen = np.arange(len(centers))
+    while True:
+        turn, shift, focal = _tied(covariance, gauge, centers, chosen)
+        badness = np.maximum(turn / _MOST_TURN_DEGREES, shift / _MOST_SHIFT)
+        worst = chosen[np.argsort(badness[chosen])]
+        bad = int((badness[chosen] > 1).sum())
+        if bad == 0 or len(chosen) <= 2:
+            return Deviations(turn_degrees=turn, shift=shift, focal=focal, lens=lens, sound=badness <= 1)
+        chosen = np.sort(worst[: -min(bad, max(1, int(_DROPPED * len(chosen))))])
+
+
+def _tied(
+    covariance: np.ndarray, gauge: np.ndarray, centers: Float[np.ndarray, "n 3"], chosen: Int[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " l"]]:
+    """Deviations of turns (degrees), places (extents) and log focal lengths in the world in which the chosen cameras
+    move least.
+    """
+    count = len(centers)
+    extent = max(float(np.linalg.norm(centers[chosen] - centers[chosen].mean(axis=0), axis=1).max()), 1e-12)
+    weight = np.zeros(len(gauge))
+    for index in chosen:
+        weight[6 * index : 6 * index + 3] = 1.0
+        weight[6 * index + 3 : 6 * index + 6] = 1 / extent**2
+    weighted = gauge * weight[:, None]
+    tie = np.eye(len(gauge)) - gauge @ np.linalg.pinv(gauge.T @ weighted) @ weighted.T
+    variances = np.einsum("ij,ij->i", tie @ covariance, tie)[: 6 * count].reshape(count, 2, 3).sum(axis=2)
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    focal = np.sqrt(np.maximum(np.diag(covariance)[6 * count :: 3], 0.0))
+    return np.degrees(deviations[:, 0]), deviations[:, 1] / extent, focal
+
+
+def epipolar_misses(
+    first: Float[np.ndarray, "m 2"],
+    second: Float[np.ndarray, "m 2"],
+    rotation: Float[np.ndarray, "3 3"],
+    way: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, " m"]:
+    """First order distances (Sampson 1982) of matches in the planes at depth 1; infinite where a lens pictures
+    nothing.
+    """
+    x, y, z = way
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    a, b = (np.concatenate([places, np.ones((len(places), 1))], axis=1) for places in (first, second))
+    lines, back = a @ essential.T, b @ essential
+    spread = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    return np.nan_to_num(np.abs((b * lines).sum(axis=1)) / np.sqrt(spread + 1e-30), nan=math.inf)
+
+
+def agreeing_shares(misses: dict[tuple[int, int], Float[np.ndarray, " _"]], count: int) -> list[float]:
+    """For each photo, the share of its matches with other photos that lie on their epipolar lines; NaN where there is
+    none.
+
+    Args:
+        misses: of the matches of two photos each, in tolerances.
+        count: of the photos.
+    """
+    good, total = np.zeros(count), np.zeros(count)
+    for pair, each in misses.items():
+        for index in pair:
+            good[index] += (each <= _ON_THE_LINE).sum()
+            total[index] += len(each)
+    return np.where(total > 0, good / np.maximum(total, 1), math.nan).tolist()
+
+
+def doubt(found: Deviations, camera: int, agreeing: float) -> str:
+    """What speaks against one of the cameras of a bundle; empty if nothing does."""
+    if agreeing < _LEAST_AGREEING:
+        return (
+            f"only {agreeing:.0%} of its matches with other photos agree with its camera, expected "
+            f"{_LEAST_AGREEING:.0%}"
+        )
+    if found.sound[camera]:
+        return ""
+    turn, shift = found.turn_degrees[camera], found.shift[camera]
+    focal = found.focal[found.lens[camera]]
+    why = f"its focal length by {min(focal, 9.99):.0%}, " if focal > _MOST_FOCAL else ""
+    off = f"{why}its direction by {turn:.2g} degrees, its place by {min(shift, 9.99):.0%} of the extent"
+    return (
+        f"the photos hardly determine its camera ({off} or so); add photos that overlap more, from places farther apart"
+    )

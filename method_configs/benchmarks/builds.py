@@ -1,0 +1,216 @@
+"""``fillerbuster bench builds``: this build of the project and another one, in turns: whole samplings, their seconds
+beside their error.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import TYPE_CHECKING, Any
+
+from method_configs.benchmarks.build_worker import ANSWER
+from method_configs.benchmarks.table_files import TableFiles
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from fb_core.evaluation.results import Report
+
+_HERE = Path(__file__).resolve().parent
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Builds(TableFiles):
+    """Whole samplings by this build and by another checkout of the project, each with its own bundled model,
+    recommended sampling and the precision that it chooses on this machine.
+    """
+
+    other: Path
+    """Root of the other checkout (git worktree add ../other COMMIT)."""
+    cases: tuple[str, ...] = ("16+24", "36+4")
+    """Known + unknown views."""
+    rooms: int = 10
+    """Unseen rooms."""
+    training_steps: int = 0
+    """Also so many training steps of the preset rooms-tiny in the paper's design, which every build knows."""
+    threads: int = 1
+    """Threads of each build."""
+
+    def run(self) -> None:
+        """Measure and report."""
+        from fb_core.evaluation.results import Report
+
+        if not (self.other / "fb_core").is_dir():
+            raise ValueError(f"other: expected the root of a checkout, which holds fb_core, got {self.other}")
+        if self.rooms < 1 or self.threads < 1:
+            raise ValueError(
+                f"bench builds: expected at least one room and one thread, got {self.rooms} and {self.threads}"
+            )
+        cases = [_case_of(text) for text in self.cases]
+        report = Report(seed=self.seed)
+        with (
+            tempfile.TemporaryDirectory(prefix="fillerbuster-builds-") as folder,
+            _Build("this", _HERE.parent, self.threads) as this,
+            _Build("other", self.other.resolve(), self.threads) as other,
+        ):
+            for known, unknown in cases:
+                report.rows.extend(self._rows(Path(folder), (this, other), known, unknown))
+            if self.training_steps:
+                report.rows.extend(self._training_rows(this, other))
+        self.publish(report, draw)
+
+    def _rows(self, folder: Path, builds: tuple[_Build, ...], known: int, unknown: int) -> list[dict[str, Any]]:
+        """The builds' figures for one case, this one's with its gain over the other one."""
+        _logger.info("%d known and %d unknown views in %d rooms", known, unknown, self.rooms)
+        found: dict[str, list[dict[str, float]]] = {build.name: [] for build in builds}
+        for number in range(self.rooms):
+            stored, truth = _stored_views(folder, known, unknown, seed=self.seed, number=number)
+            for build in builds:
+                found[build.name].append(build.complete(stored, truth, known, seed=self.seed + number))
+        return [self._row(build, found, builds[-1].name, f"{known}+{unknown}") for build in builds]
+
+    def _training_rows(self, this: _Build, other: _Build) -> list[dict[str, Any]]:
+        """Both builds' training steps; the loss is a running mean over all of them."""
+        _logger.info("%d training steps", self.training_steps)
+        found = [(this.trained(), other.trained()) for _ in range(self.training_steps)]
+        return [
+            {
+                "part": "a training step", "build": f"{build.name} ({_commit_of(build.root)})",
+                "steps": self.training_steps,
+                "cpu_seconds": median(pair[number]["cpu_seconds"] for pair in found),
+                "seconds": median(pair[number]["seconds"] for pair in found),
+                "times_as_fast": median(pair[1]["cpu_seconds"] / pair[number]["cpu_seconds"] for pair in found),
+                "loss": found[-1][number]["loss"],
+            }
+            for number, build in enumerate((this, other))
+        ]  # fmt: skip
+
+    def _row(self, build: _Build, found: dict[str, list[dict[str, float]]], against: str, case: str) -> dict[str, Any]:
+        """One build's figures for one case, with its gain over the other one, room by room."""
+        mine, theirs = found[build.name], found[against]
+        psnrs = [one["psnr"] for one in mine]
+        gains = [one["psnr"] - other["psnr"] for one, other in zip(mine, theirs, strict=True)]
+        times = [other["cpu_seconds"] / one["cpu_seconds"] for one, other in zip(mine, theirs, strict=True)]
+        return {
+            "part": f"{case} views", "case": case, "build": f"{build.name} ({_commit_of(build.root)})",
+            "steps": build.steps,
+            "rooms": len(mine), "cpu_seconds": median(one["cpu_seconds"] for one in mine),
+            "seconds": median(one["seconds"] for one in mine), "psnr": mean(psnrs),
+            "psnr_error": _standard_error(psnrs),
+            "times_as_fast": median(times), "psnr_gain": mean(gains), "psnr_gain_error": _standard_error(gains),
+        }  # fmt: skip
+
+
+class _Build:
+    """A process that runs one checkout's code."""
+
+    def __init__(self, name: str, root: Path, threads: int):
+        self.name, self.root, self._threads = name, root, threads
+
+    def __enter__(self) -> _Build:
+        environment = os.environ | {"PYTHONPATH": str(self.root), "OMP_NUM_THREADS": str(self._threads)}
+        self._process = subprocess.Popen(
+            [sys.executable, str(_HERE / "build_worker.py")], cwd=self.root, env=environment,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        self.steps = self._answer()["steps"]
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def complete(self, stored: Path, truth: Float[Tensor, "m 3 h w"], known: int, *, seed: int) -> dict[str, float]:
+        """Seconds, CPU seconds and PSNR of the unknown views."""
+        import numpy as np
+        import torch
+
+        from fb_core.evaluation.metrics.image_metrics import psnr
+
+        answer = stored.with_suffix(".answer.npy")
+        took = self._asked({"views": str(stored), "known": known, "seed": seed, "answer": str(answer)})
+        return took | {"psnr": float(psnr(torch.from_numpy(np.load(answer)), truth).mean())}
+
+    def trained(self) -> dict[str, Any]:
+        """Seconds, CPU seconds and loss of a further training step."""
+        return self._asked({})
+
+    def _asked(self, question: dict[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        print(json.dumps(question), file=self._process.stdin, flush=True)
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith(ANSWER):
+                return json.loads(line[len(ANSWER) :])
+        raise ValueError(
+            f"the build in {self.root} ended with code {self._process.wait()}; it has to run in this environment"
+        )
+
+
+def _case_of(text: str) -> tuple[int, int]:
+    try:
+        known, unknown = map(int, text.split("+"))
+    except ValueError:
+        known = unknown = 0
+    if not (1 <= known <= 1000 and 1 <= unknown <= 1000):
+        raise ValueError(f"cases: expected KNOWN+UNKNOWN views such as 16+24, got {text!r}")
+    return known, unknown
+
+
+def _stored_views(
+    folder: Path, known: int, unknown: int, *, seed: int, number: int
+) -> tuple[Path, Float[Tensor, "m 3 h w"]]:
+    """A file with the views of an unseen room, and the truth of the unknown ones."""
+    import numpy as np
+
+    from fb_core.evaluation.completion import unseen_room
+    from fb_core.geometry.raymap import raymaps_of
+
+    room = unseen_room(family="narrow", seed=seed, number=number, views=known + unknown, size=64)
+    path = folder / f"{known}+{unknown}-{number}.npz"
+    np.savez(path, images=room.images.numpy(), raymaps=raymaps_of(room.cameras).float().numpy())
+    return path, room.images[known:]
+
+
+def _standard_error(values: list[float]) -> float:
+    return stdev(values) / len(values) ** 0.5 if len(values) > 1 else float("nan")
+
+
+def _commit_of(root: Path) -> str:
+    done = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() if done.returncode == 0 else "unknown"
+
+
+def draw(report: Report, path: Path) -> None:
+    """PSNR over CPU seconds, one line a case from the other build to this one."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 4), layout="constrained")
+    axes = figure.subplots()
+    for case in dict.fromkeys(row["case"] for row in report.rows if "case" in row):
+        rows = [row for row in report.rows if row.get("case") == case]
+        axes.plot(
+            [row["cpu_seconds"] for row in rows], [row["psnr"] for row in rows], marker="o", label=f"{case} views"
+        )
+        for row in rows:
+            axes.annotate(row["build"], (row["cpu_seconds"], row["psnr"]), fontsize=7)
+    axes.set(xscale="log", xlabel="CPU seconds of a whole sampling", ylabel="PSNR of unknown views (dB)")
+    axes.legend()
+    from fb_core.files.whole import whole_file
+
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, format=path.suffix[1:] or "png")

@@ -1,0 +1,153 @@
+"""``fillerbuster bench inference``: seconds of a whole sampling by views, size and steps, on the device at hand (paper,
+table 3).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from method_configs.benchmarks.table_files import TableFiles, chosen_device
+
+if TYPE_CHECKING:
+    from fb_core.evaluation.results import Report
+    from fb_core.inpainter import Fillerbuster
+
+PAPER_SECONDS = {
+    256: {4: 9, 8: 9, 16: 12, 32: 23},
+    512: {4: 12, 8: 23, 16: 53, 32: 120},
+}
+"""Table 3 of the paper: an A100, 50 steps, with encoding and decoding; by side in pixels and number of views."""
+_PAPER_STEPS = 50
+_FEW = (4, 12)  # steps that are measured where the rest is reckoned
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inference(TableFiles):
+    """Seconds of a whole sampling, encoding and decoding included, beside the paper's A100; long ones are reckoned from
+    few steps.
+    """
+
+    model: Path | None = None
+    """Model folder; by default the bundled one."""
+    views: tuple[int, ...] = (4, 8, 16, 32)
+    """Views of a sequence, half of them known."""
+    sizes: tuple[int, ...] = (256, 512)
+    """Sides in pixels, multiples of 16."""
+    steps: tuple[int, ...] = (50, 24)
+    """Denoising steps."""
+    reckoned: bool | None = None
+    """Measure 4 and 12 steps and reckon the rest, as every step costs the same; by default on CPUs."""
+    device: str | None = None
+    """Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one."""
+
+    def run(self) -> None:
+        """Measure what was not measured before, and report."""
+        from rich.progress import track
+
+        from fb_core.evaluation.results import Report
+        from fb_core.inpainter import Fillerbuster
+
+        if not self.views or not self.sizes or not self.steps or min(self.views) < 1 or min(self.steps) < 1:
+            raise ValueError(
+                f"inference: expected numbers of views, sizes and steps from 1, got {self.views}, {self.sizes}, "
+                f"{self.steps}"
+            )
+        if any(size < 16 or size % 16 for size in self.sizes):
+            raise ValueError(
+                f"inference: expected sizes that are multiples of 16 pixels, got {' '.join(map(str, self.sizes))}"
+            )
+        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
+        reckoned = model.device.type == "cpu" if self.reckoned is None else self.reckoned
+        cells = [(size, views) for size in self.sizes for views in self.views]
+        report = Report(seed=self.seed)
+        for size, views in track(cells, description="inference", transient=True):
+            report.rows.extend(self._rows(model, size, views, reckoned))
+        self.publish(report, draw)
+
+    def _rows(self, model: Fillerbuster, size: int, views: int, reckoned: bool) -> list[dict[str, Any]]:
+        from fb_core.evaluation.results import hardware
+
+        counts = _FEW if reckoned else tuple(self.steps)
+        asked = {
+            "model": model.model_hash,
+            "hardware": hardware(),
+            "device": str(model.device),
+            "counts": list(counts),
+            "seed": self.seed,
+        }
+
+        def measure() -> dict[str, float]:
+            timed(model, views, size, 1, self.seed)  # what is set up at first use
+            return {str(count): timed(model, views, size, count, self.seed) for count in counts}
+
+        seconds = {int(count): value for count, value in self.kept(f"{size}-{views}", asked, measure).items()}
+        rows = []
+        for steps in self.steps:
+            value = reckoned_seconds(seconds, steps) if reckoned else seconds[steps]
+            paper = PAPER_SECONDS.get(size, {}).get(views) if steps == _PAPER_STEPS else None
+            rows.append(
+                {
+                    "part": f"inference with {model.info.get('preset', 'the model')} ({model.model_hash[:8]}), half of the views known",
+                    "size": size, "views": views, "steps": steps, "seconds": value,
+                    "how": "reckoned" if reckoned else "measured",
+                    "device": str(model.device), "parameters": sum(weight.numel() for weight in model.dit.parameters()),
+                    "paper_a100_seconds": paper,
+                }
+            )  # fmt: skip
+        return rows
+
+
+def reckoned_seconds(seconds: dict[int, float], steps: int) -> float:
+    """The line through the times of two numbers of steps; never less than the shorter one."""
+    (few, short), (more, long) = sorted(seconds.items())
+    return short + max(0.0, long - short) / (more - few) * (steps - few) if steps >= few else short
+
+
+def timed(model: Fillerbuster, views: int, size: int, steps: int, seed: int) -> float:
+    """Seconds of one whole sampling: pictures in memory to pictures in memory."""
+    import dataclasses
+    import time
+
+    import torch
+
+    from fb_core.geometry.cameras import Pinholes
+    from fb_core.views import Views
+
+    draw = torch.Generator().manual_seed(seed)
+    angles = torch.arange(views) * 2 * torch.pi / views
+    centers = torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    cameras = Pinholes.looking_at(2 * centers, 0.1 * centers, up=up, fov_degrees=60.0, width=size, height=size)
+    known = torch.zeros(views, 1, size, size)
+    known[: max(1, views // 2)] = 1
+    asked = dataclasses.replace(
+        Views.known(torch.rand(views, 3, size, size, generator=draw), cameras), image_known=known
+    )
+    sampling = dataclasses.replace(model.recommended_sampling, steps=steps)
+    began = time.perf_counter()
+    model.complete(asked, generator=torch.Generator().manual_seed(seed), sampling=sampling)
+    if model.device.type == "cuda":
+        torch.cuda.synchronize(model.device)
+    return time.perf_counter() - began
+
+
+def draw(report: Report, path: Path) -> None:
+    """Seconds over the number of views, a curve for each size and number of steps, and the paper's beside them."""
+    from method_configs.benchmarks.command import _axes, _save
+
+    figure, axes = _axes("seconds")
+    for size, steps in dict.fromkeys((row["size"], row["steps"]) for row in report.rows):
+        rows = [row for row in report.rows if (row["size"], row["steps"]) == (size, steps)]
+        label = f"{size} pixels, {steps} steps, {rows[0]['how']}"
+        axes.plot([row["views"] for row in rows], [row["seconds"] for row in rows], "o-", label=label)
+        paper = [(row["views"], row["paper_a100_seconds"]) for row in rows if row["paper_a100_seconds"] is not None]
+        if paper:
+            axes.plot(*zip(*paper, strict=True), "x--", label=f"paper: A100, {size} pixels, {steps} steps, its model")
+    axes.set_yscale("log")
+    axes.set_xlabel("views")
+    axes.legend()
+    _save(figure, path)

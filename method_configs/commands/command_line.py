@@ -1,0 +1,437 @@
+"""The ``fillerbuster`` command: rooms, train, convert, complete, demo, sheet, export, bench, eval, check.
+
+Only light modules are imported here, so that ``fillerbuster --help`` answers at once; each command imports what it
+needs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from fb_core.files.faults import sentence_of
+from fb_core.files.ownership import require_own_or_new
+from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
+from method_configs.benchmarks.builds import Builds
+from method_configs.benchmarks.command import Networks, Precision
+from method_configs.benchmarks.fit import Fit
+from method_configs.benchmarks.inference import Inference
+from method_configs.benchmarks.methods import Methods
+from method_configs.benchmarks.poses.command import Poses
+from method_configs.benchmarks.sampler.command import Sampler
+from method_configs.benchmarks.splats.command import Splat
+from method_configs.entrance import DEBUG_VARIABLE
+from method_configs.evaluations.ablations import Ablations
+from method_configs.evaluations.conditioning import Conditioning
+from method_configs.evaluations.consistency import Consistency
+from method_configs.evaluations.designs.command import Designs
+from method_configs.evaluations.masked import Masked, Paper
+from method_configs.evaluations.model import ModelOnCaptures
+from method_configs.evaluations.rooms import Rooms
+from method_configs.evaluations.scaling import Scaling
+from method_configs.evaluations.scene import Scene
+from method_configs.evaluations.trust import Trust
+from method_configs.evaluations.uncalibrated import Uncalibrated
+
+
+def rooms(
+    *,
+    output: Path,
+    seed: int = 0,
+    family: Literal["narrow", "medium", "wide"] = "narrow",
+    views: int = 24,
+    size: int = 128,
+    held_out: int = 16,
+    ground_truth: bool = False,
+) -> None:
+    """Make the casual capture of one procedural room, as a folder for ns-train.
+
+    Args:
+        output: New folder for the capture.
+        seed: Which room (0 or more); the same seed gives the same files.
+        family: How varied room and cameras are; the bundled model knows narrow rooms.
+        views: Captured pictures.
+        size: Width and height of the pictures in pixels.
+        held_out: Further ground-truth pictures, half of them covered by the capture and half not.
+        ground_truth: Also write depth and normals as EXR files.
+    """
+    from fb_core.data.rooms import room_captures
+
+    room_captures.rooms(
+        seed, output, family=family, views=views, size=size, held_out=held_out, ground_truth=ground_truth
+    )
+
+
+def train(
+    preset: Annotated[str, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    stage: Literal["all", "image-vae", "raymap-vae", "dit"] = "all",
+    steps: int | None = None,
+    minutes: float | None = None,
+    device: str | None = None,
+    half: bool = True,
+    precision: Literal["auto", "float32", "bfloat16"] | None = None,
+    accumulate: int | None = None,
+    recompute: bool = False,
+    shard: bool = False,
+    sheet_every: int | None = None,
+    keep: int | None = None,
+    tensorboard: bool = False,
+    dry_run: bool = False,
+    captures: Path | None = None,
+    meshes: Path | None = None,
+    images: str | None = None,
+    rooms: bool = False,
+    text_encoder: Path | None = None,
+    lpips: Path | None = None,
+    start_from: Path | None = None,
+) -> None:
+    """Train a model; the same command again goes on where the last one ended. Under torchrun on many devices.
+
+    Args:
+        preset: What to train, e.g. rooms-tiny (the bundled model).
+        output: Folder of the training; the finished model is its subfolder "model".
+        stage: One stage, or all three in turn.
+        steps: Steps per stage instead of the preset's.
+        minutes: Stop after so many minutes; a transformer that is not done by then is exported as it is.
+        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
+        half: Store the model in half precision (the raymap autoencoder never is).
+        precision: Of matrix products and convolutions instead of the preset's (auto: bfloat16 where it is faster);
+            weights stay float32.
+        accumulate: Parts that each process does its share of a batch in, one after the other, to save memory.
+        recompute: Keep no activations inside blocks, to save memory for a third more time.
+        shard: Spread the transformer's weights over the processes (FSDP).
+        sheet_every: Steps between sample sheets of an unseen room.
+        keep: Checkpoints kept.
+        tensorboard: Also write TensorBoard's files.
+        dry_run: Only say sizes, memory and speed of the stages here, measured in a few steps; nothing is written.
+        captures: Folder with captures at any depth (each with a transforms.json) to learn from instead of rooms.
+        meshes: Folder with mesh files at any depth to learn from instead of rooms.
+        images: WebDataset shards of captioned pictures: a folder, or a pattern such as URL/{0000..9999}.tar.
+        rooms: Procedural rooms beside captures and meshes.
+        text_encoder: Clone of openai/clip-vit-large-patch14, for presets that read text.
+        lpips: Weights of SqueezeNet 1.1 as torchvision stores them, for the image autoencoder's perceptual loss.
+        start_from: Model folder whose weights the training begins with; its autoencoders are kept as they are.
+    """
+    from method_configs.commands.training import train_preset
+
+    train_preset(
+        preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half, precision=precision,
+        accumulate=accumulate,
+        recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run,
+        captures=captures,
+        meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips, start_from=start_from,
+    )  # fmt: skip
+
+
+def convert(
+    checkpoints: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    text_encoder: Path | None = None,
+    half: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Turn the authors' released checkpoints into a model folder.
+
+    Args:
+        checkpoints: Folder with transformer.ckpt, image-vae.ckpt and pose-vae.ckpt.
+        output: New folder for the model.
+        text_encoder: Folder with the CLIP text model; stores the embedding of the empty prompt, so that CLIP is needed
+            no more.
+        half: Store in half precision (the raymap autoencoder never is).
+        overwrite: Replace an earlier model there.
+    """
+    import torch
+
+    from fb_core import checkpoint
+
+    dtype = torch.float16 if half else None
+    folder = checkpoint.convert(checkpoints, output, dtype=dtype, text_encoder=text_encoder, overwrite=overwrite)
+    logging.getLogger(__name__).info("wrote the model to %s", folder)
+
+
+def complete(
+    source: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    output: Path,
+    cameras: Literal["auto", "model", "features"] = "auto",
+    path: str = "ellipse",
+    views: int = 32,
+    photos: int = 16,
+    poses_only: bool = False,
+    known_poses: Path | None = None,
+    model: Path | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    steps: int | None = None,
+    sequence: int = 48,
+    prompt: str | None = None,
+    text_encoder: Path | None = None,
+    device: str | None = None,
+    precision: Literal["auto", "float32", "bfloat16"] = "auto",
+    fps: float = 8.0,
+    check: bool = True,
+    frames: Literal["scene", "model"] = "scene",
+    minutes: float = 5.0,
+    film_size: int | None = None,
+    photo_size: int | None = None,
+    iterations: int | None = None,
+    generate: bool = True,
+    overwrite: bool = False,
+) -> None:
+    """Complete a scene from photos alone: cameras, splats, views of what no photo shows; leaves a film, and a capture
+    for ns-train.
+
+    Args:
+        source: Folder of photos, film, or posed capture (whose cameras are then known).
+        output: New folder: capture, splats.ply, fly-through.mp4, trust.mp4, sheet.png, cameras.png, raymaps,
+            report.json.
+        cameras: What finds cameras: the model's raymaps, features, or the model and, where it is not sure, features.
+        path: ellipse (fitted to the cameras), orbit, spiral, or a camera path's JSON file in the world of the capture.
+        views: Pictures of the film along the path.
+        photos: Photos that new views are conditioned on, chosen by coverage; all photos get cameras.
+        poses_only: Find cameras and generate nothing.
+        known_poses: Capture that knows the cameras of some of the photos, by their file names.
+        model: Model folder; by default the bundled one.
+        seed: Decides all that is drawn.
+        size: Side of new views in pixels; by default the model's.
+        steps: Denoising steps; by default the model's recommendation.
+        sequence: With --frames model, most views, photos and new ones together, that the model sees at once; more come
+            in further passes.
+        prompt: What is to be seen, for models that read text.
+        text_encoder: Folder with the CLIP text model, which prompts need.
+        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
+        precision: Of the model's matrix products (auto: bfloat16 where the machine is faster at it).
+        fps: Pictures per second of the film.
+        check: With --frames model, look for the cameras of photos and new views once more, and report how far they are
+            off.
+        frames: scene: the film shows splats of the photos, with new views where no photo shows anything; model: the
+            model's own pictures of the path (the paper).
+        minutes: Time that a scene may take, about; it decides the sizes and steps that are not given.
+        film_size: Longest side of the scene's film in pixels, at most that of the photos.
+        photo_size: Longest side of the photos that splats are trained on.
+        iterations: Training steps of the splats.
+        generate: Let the model make up what no photo shows; without, the scene shows what photos do.
+        overwrite: Replace an earlier output there.
+    """
+    from method_configs.commands.complete.command import complete_scene
+    from method_configs.commands.complete.options import CompleteOptions
+
+    options = CompleteOptions(
+        cameras=cameras,
+        path=path,
+        views=views,
+        photos=photos,
+        poses_only=poses_only,
+        known_poses=known_poses,
+        model=model,
+        seed=seed,
+        size=size,
+        steps=steps,
+        sequence=sequence,
+        prompt=prompt,
+        text_encoder=text_encoder,
+        device=device,
+        precision=precision,
+        fps=fps,
+        check=check,
+        frames=frames,
+        minutes=minutes,
+        film_size=film_size,
+        photo_size=photo_size,
+        iterations=iterations,
+        generate=generate,
+    )
+    complete_scene(source, output, options, overwrite=overwrite)
+
+
+def demo(
+    *,
+    output: Path = Path("outputs/demo"),
+    seed: int = 0,
+    iterations: int = 1500,
+    model: Path | None = None,
+) -> None:
+    """Complete a small room from end to end and compare with plain splatting, on this machine.
+
+    Args:
+        output: Folder for the capture, both runs, report.png and metrics.json; an earlier demo there is replaced.
+        seed: Which room.
+        iterations: Training steps of each run.
+        model: Model folder; by default the bundled one.
+    """
+    from method_configs.commands.demo import run_demo
+
+    run_demo(output, seed=seed, iterations=iterations, model=model)
+
+
+def sheet(
+    run: Annotated[Path, tyro.conf.Positional], /, *, output: Path = Path("sheet.png"), before: Path | None = None
+) -> None:
+    """Draw what a run of ns-train was given, what it generated, and what it renders, as one picture.
+
+    Args:
+        run: Folder of the run, which holds config.yml.
+        output: The picture.
+        before: Folder of another run on the same capture, drawn too at the same cameras, for a picture of before and
+            after.
+    """
+    from method_configs.commands.sheet import write_sheet
+
+    write_sheet(run, output, before=before)
+
+
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    format: Literal["nerfstudio", "colmap"],
+    output: Path | None = None,
+    held_out: bool = True,
+    overwrite: bool = False,
+) -> None:
+    """Write the completed capture of a run, captured and generated views, as a dataset for other tools.
+
+    Args:
+        run: Folder of the run, which holds config.yml; finished, or killed after it had generated views.
+        format: nerfstudio writes transforms.json, colmap a model in sparse/0.
+        output: Folder of the dataset; by default export-nerfstudio or export-colmap in the run's folder.
+        held_out: Also write the captured views that the run did not train on; lists tell them apart.
+        overwrite: Replace an earlier export there.
+    """
+    from method_configs.commands.export import export_run
+
+    export_run(run, format=format, output=output, held_out=held_out, overwrite=overwrite)
+
+
+def bench(
+    *,
+    benchmark: tyro.conf.OmitArgPrefixes[
+        Annotated[Networks, tyro.conf.subcommand("networks")]
+        | Annotated[Precision, tyro.conf.subcommand("precision")]
+        | Annotated[Sampler, tyro.conf.subcommand("sampler")]
+        | Annotated[Poses, tyro.conf.subcommand("poses")]
+        | Annotated[Splat, tyro.conf.subcommand("splat")]
+        | Annotated[Fit, tyro.conf.subcommand("fit")]
+        | Annotated[Methods, tyro.conf.subcommand("methods")]
+        | Annotated[Inference, tyro.conf.subcommand("inference")]
+        | Annotated[Paper, tyro.conf.subcommand("paper")]
+        | Annotated[Builds, tyro.conf.subcommand("builds")]
+    ],
+) -> None:
+    """Measure time, memory and error on this machine."""
+    _require_free_places(benchmark)
+    benchmark.run()
+
+
+def evaluate(
+    *,
+    evaluation: tyro.conf.OmitArgPrefixes[
+        Annotated[Rooms, tyro.conf.subcommand("rooms")]
+        | Annotated[Scaling, tyro.conf.subcommand("scaling")]
+        | Annotated[Uncalibrated, tyro.conf.subcommand("uncalibrated")]
+        | Annotated[Ablations, tyro.conf.subcommand("ablations")]
+        | Annotated[Conditioning, tyro.conf.subcommand("conditioning")]
+        | Annotated[Consistency, tyro.conf.subcommand("consistency")]
+        | Annotated[ModelOnCaptures, tyro.conf.subcommand("model")]
+        | Annotated[Masked, tyro.conf.subcommand("masked")]
+        | Annotated[Designs, tyro.conf.subcommand("designs")]
+        | Annotated[Scene, tyro.conf.subcommand("scene")]
+        | Annotated[Trust, tyro.conf.subcommand("trust")]
+    ],
+) -> None:
+    """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""
+    _require_free_places(evaluation)
+    evaluation.run()
+
+
+def _require_free_places(command: object) -> None:
+    """Raises ValueError, before hours of measuring, where a result would take the place of a file that is none."""
+    for name in ("json", "csv", "markdown", "figure", "sheet"):
+        path = getattr(command, name, None)
+        if isinstance(path, Path):
+            require_own_or_new(path)
+
+
+def check(*, mend: bool = False) -> None:
+    """Say what this machine lacks, in one sentence each.
+
+    Args:
+        mend: Install OpenCV's contrib build again if another build has replaced it.
+    """
+    from method_configs import environment
+
+    environment.check(mend=mend)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "rooms": rooms,
+    "train": train,
+    "convert": convert,
+    "complete": complete,
+    "demo": demo,
+    "sheet": sheet,
+    "export": export,
+    "bench": bench,
+    "eval": evaluate,
+    "check": check,
+}
+"""Every subcommand by its name."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The console script. An error that a user can mend is one sentence on stderr and a non-zero exit code."""
+    _show_log()
+    stop_on_signals()
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="fillerbuster",
+            description=f"Complete casual captures. Set {DEBUG_VARIABLE}=1 for tracebacks.",
+            args=None if arguments is None else list(arguments),
+        )
+    except KeyboardInterrupt as error:
+        _stop(error, "Stopped.", ENDED_BY_USER)
+    except (ValueError, FloatingPointError, OSError) as error:
+        _stop(error, f"Error: {sentence_of(error)}", 1)
+
+
+def _stop(error: BaseException, sentence: str, code: int) -> None:
+    if os.environ.get(DEBUG_VARIABLE):
+        raise error
+    sys.stderr.write(" ".join(sentence.split()) + "\n")
+    sys.exit(code)
+
+
+def _show_log() -> None:
+    """Our own messages from INFO upwards, other packages' from WARNING upwards, on stderr in rich's manner.
+
+    What packages tell each other of their future (FutureWarning) is nothing that a user can mend.
+    """
+    import warnings
+
+    warnings.simplefilter("ignore", FutureWarning)
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    handler = RichHandler(
+        console=Console(stderr=True, soft_wrap=True), show_time=False, show_path=False, show_level=False, markup=False
+    )
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    for package in ("fb_core", "fb_nerfstudio", "method_configs"):
+        logging.getLogger(package).setLevel(logging.INFO)
+
+
+if __name__ == "__main__":
+    main()

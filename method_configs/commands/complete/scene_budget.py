@@ -1,0 +1,161 @@
+"""How large a film is and how long its splats are trained, so that all of it takes about the time a person gives."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+
+from fb_core.geometry.cameras import Pinholes
+from fb_nerfstudio.splats.backend import render_splats
+from fb_nerfstudio.splats.scene_film import film_frame
+from fb_nerfstudio.splats.splat_file import Splats
+from method_configs.commands.complete.scene_training import SceneSchedule
+
+_COMPLETE_AT = 500  # as ns-train fillerbuster
+FEWEST_STEPS, MOST_STEPS = 300, 7000
+_WANTED_STEPS = 1500  # enough for what photos show; more time goes into larger pictures first
+_SIDES = (64, 96, 128, 160, 240, 320, 480, 640, 960, 1280, 1920, 2560, 3840)  # of pictures that splats are trained on
+_TRAINING_SHARE, _FILM_SHARE = (
+    0.65,
+    0.2,
+)  # of the time; the rest is for new views, files, and for guesses that were too low
+_PROBE_SIDE, _PROBE_SPLATS = 96, 4000
+_LEAST_SECONDS = 10.0
+_ON_CPU, _ON_GPU = 20_000, 500_000  # Gaussians
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed:
+    """What this machine does just now."""
+
+    step: float
+    """Seconds of a training step for each pixel."""
+    frame: float
+    """Seconds of a film's frame for each pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneBudget:
+    """Sizes and steps."""
+
+    photo_side: int
+    """Longest side in pixels of the photos that splats are trained on."""
+    film_side: int
+    """Longest side in pixels of the film."""
+    schedule: SceneSchedule
+    """Of the training."""
+    seconds: float
+    """That this may take, new views left out."""
+
+    @staticmethod
+    def of(
+        seconds: float,
+        speed: Speed,
+        *,
+        frames: int,
+        longest: int,
+        aspect: float,
+        device: str,
+        steps: int | None = None,
+        photo_side: int | None = None,
+        film_side: int | None = None,
+    ) -> SceneBudget:
+        """What fits into a time.
+
+        Args:
+            seconds: that are left.
+            speed: of the machine.
+            frames: of the film.
+            longest: side of the photos in pixels, which nothing exceeds.
+            aspect: of a picture's shorter side to its longer one, from 0 to 1.
+            device: where splats are trained.
+            steps: of the training, where they are given.
+            photo_side: of the photos, where it is given.
+            film_side: of the film, where it is given.
+        """
+        seconds = max(seconds, _LEAST_SECONDS)
+        wanted = _WANTED_STEPS if steps is None else steps
+
+        def training(side: int, steps: int) -> float:
+            return steps * speed.step * aspect * side**2
+
+        def film(side: int) -> float:
+            return frames * speed.frame * aspect * side**2
+
+        side = photo_side or max(
+            [one for one in _SIDES if one < longest and training(one, wanted) <= _TRAINING_SHARE * seconds]
+            or [_SIDES[0]]
+        )
+        side = min(side, longest)
+        if steps is None:
+            affordable = _TRAINING_SHARE * seconds / max(training(side, 1), 1e-9)
+            steps = int(min(max(affordable, FEWEST_STEPS), MOST_STEPS)) // 10 * 10
+        # Splats know no more than the photos that they were trained on: beyond twice that size a film only gets larger.
+        film_side = film_side or max(
+            [one for one in _SIDES if one <= 2 * side and film(one) <= _FILM_SHARE * seconds] or [_SIDES[0]]
+        )
+        film_side = min(film_side, longest)
+        most = _ON_GPU if torch.device(device).type == "cuda" else _ON_CPU
+        return SceneBudget(
+            photo_side=side,
+            film_side=film_side,
+            schedule=SceneSchedule(steps=steps, complete_at=min(_COMPLETE_AT, max(1, steps // 2)), most_gaussians=most),
+            seconds=training(side, steps) + film(film_side),
+        )
+
+
+def measured_speed(device: str) -> Speed:
+    """Of a few small pictures, which takes about a second."""
+    generator = torch.Generator().manual_seed(0)
+    count, side = _PROBE_SPLATS, _PROBE_SIDE
+    splats = Splats(
+        means=torch.rand(count, 3, generator=generator) * torch.tensor([2.0, 2.0, 1.0])
+        - torch.tensor([1.0, 1.0, -1.5]),
+        log_scales=torch.full((count, 3), -3.5),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1),
+        logits=torch.randn(count, generator=generator),
+        harmonics=torch.rand(count, 4, 3, generator=generator),
+    )
+    camera = Pinholes(
+        camera_to_world=torch.eye(4)[None, :3],
+        focal=torch.full((1, 2), float(side)),
+        principal=torch.full((1, 2), side / 2),
+        width=side,
+        height=side,
+    )
+    if torch.device(device).type == "cuda":
+        return Speed(step=2e-8, frame=1e-8)  # a step of gsplat takes some milliseconds whatever the size
+    steps, frames = [], []
+    for _ in range(4):
+        began = time.perf_counter()
+        _step(splats, camera)
+        between = time.perf_counter()
+        film_frame(splats, torch.ones(count, dtype=torch.bool), camera)
+        steps.append(between - began)
+        frames.append(time.perf_counter() - between)
+    return Speed(step=_STEP_FACTOR * min(steps) / side**2, frame=_FRAME_FACTOR * min(frames) / side**2)
+
+
+_STEP_FACTOR, _FRAME_FACTOR = 1.4, 1.2  # losses, optimizer and denser scenes beside the bare probe
+
+
+def _step(splats: Splats, camera: Pinholes) -> None:
+    given = {
+        name: getattr(splats, name).clone().requires_grad_()
+        for name in ("means", "log_scales", "quats", "logits", "harmonics")
+    }
+    drawn = render_splats(
+        means=given["means"],
+        quats=given["quats"],
+        scales=given["log_scales"].exp(),
+        opacities=given["logits"].sigmoid(),
+        colors=given["harmonics"],
+        viewmats=camera.world_to_camera,
+        Ks=camera.intrinsics,
+        width=camera.width,
+        height=camera.height,
+        sh_degree=1,
+    )
+    drawn.colors.square().mean().backward()

@@ -1,0 +1,283 @@
+"""``fillerbuster train``: a preset's stages one after the other, then the exported model folder; on one process or
+many.
+
+Nothing but fb_core and torch is needed here, so that a bare GPU machine can train (`method_configs.train` is its
+entrance).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import logging
+import math
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+
+from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
+from fb_core.data.training.folders import TrainingData
+from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
+from fb_core.training.dry_run import Cost, measure
+from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
+from fb_core.training.run.checkpoints import read_state
+from fb_core.training.run.distributed import Group, joined
+from fb_core.training.run.loop import EngineConfig, OnProgress
+from fb_core.training.run.progress_log import ProgressLog
+from method_configs.presets import PRESETS
+
+_logger = logging.getLogger(__name__)
+_SECONDS_BETWEEN_LINES = 30.0
+GIB = 2**30
+
+
+def train_preset(
+    preset: str,
+    output: Path,
+    *,
+    stage: str = "all",
+    steps: int | None = None,
+    minutes: float | None = None,
+    device: str | None = None,
+    half: bool = True,
+    precision: str | None = None,
+    accumulate: int | None = None,
+    recompute: bool = False,
+    shard: bool = False,
+    sheet_every: int | None = None,
+    keep: int | None = None,
+    tensorboard: bool = False,
+    dry_run: bool = False,
+    captures: Path | None = None,
+    meshes: Path | None = None,
+    images: str | None = None,
+    rooms: bool = False,
+    text_encoder: Path | None = None,
+    lpips: Path | None = None,
+    start_from: Path | None = None,
+) -> Path | None:
+    """Train what is not trained yet and export; returns the model's folder, or None while stages are missing.
+
+    Stages end in order: when the time is up in one, those after it are not begun, because the transformer learns the
+    latents of finished autoencoders. Options of the engine that are None or False are the preset's. Under torchrun all
+    its processes train together. ``start_from`` is a model folder to begin with; its autoencoders are kept unless a
+    stage of theirs is named. The options from ``captures`` to ``lpips`` say where the data lie
+    (:class:`fb_core.data.training.folders.TrainingData`).
+
+    Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive. SystemExit
+    when a signal ended it, after a checkpoint.
+    """
+    data = TrainingData(
+        captures=captures, meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips
+    )
+    recipe = dataclasses.replace(_recipe(preset), data=data, start_from=start_from)
+    _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
+    require_between("steps", steps or 1, 1, MOST_TRAINING_STEPS)
+    stages = STAGES if stage == "all" else (stage,)
+    chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
+    flags = {"recompute": recompute, "shard": shard, "tensorboard": tensorboard}
+    changes = {name: value for name, value in chosen.items() if value is not None} | {
+        name: True for name, value in flags.items() if value
+    }
+    engine = dataclasses.replace(recipe.engine, **changes)
+    if not dry_run:
+        _require_own_model_or_free(output, start_from)  # before days of training, not after them
+    with joined(_device(device)) as (group, where):
+        if dry_run:
+            for name in stages:
+                _say(group, "%s", _told(name, measure(recipe, name, device=where, engine=engine, group=group)))
+            return None
+        if stage == "all" and group.is_main:
+            adopt_autoencoders(recipe, output)
+        group.wait()
+        if not _train_stages(
+            recipe, stages, output, where, steps, math.inf if minutes is None else minutes, engine, group
+        ):
+            return None
+        if group.is_main:
+            export(recipe, output, output / "model", dtype=torch.float16 if half else torch.float32)
+        return output / "model"
+
+
+def _train_stages(
+    recipe: Recipe,
+    stages: tuple[str, ...],
+    output: Path,
+    device: torch.device,
+    steps: int | None,
+    minutes: float,
+    engine: EngineConfig,
+    group: Group,
+) -> bool:
+    """Whether every stage has been trained, if only in part."""
+    until = time.monotonic() + 60 * minutes
+    for name in stages:
+        if _steps_done(output / name) >= (steps or _steps_planned(recipe, name)):
+            _say(group, "%s is trained already", name)
+            if group.is_main and not (output / name / "loss.png").exists():
+                ProgressLog(
+                    output / name, name, from_step=_steps_done(output / name)
+                ).close()  # killed before it was drawn
+            continue
+        if group.any(time.monotonic() >= until):
+            break
+        left = (until - time.monotonic()) / 60
+        with _progress(name, group) as show:
+            run = run_stage(
+                recipe,
+                name,
+                output,
+                device=device,
+                steps=steps,
+                minutes=left,
+                on_progress=show,
+                engine=engine,
+                group=group,
+            )
+        if run.signal:
+            _say(group, "%s stopped by signal %d at step %d of %d, which is saved; the same command goes on from there",
+                 name, run.signal, run.step, run.config.steps)  # fmt: skip
+            sys.exit(128 + run.signal)
+        if run.step < run.config.steps:
+            _say(
+                group,
+                "%s stopped at step %d of %d; the same command goes on from there",
+                name,
+                run.step,
+                run.config.steps,
+            )
+            break
+    return all(_steps_done(output / name) for name in STAGES)
+
+
+def _require_own_model_or_free(output: Path, start_from: Path | None) -> None:
+    """Raises ValueError where the training's model would replace one that it has not made itself, or the one that it
+    begins with.
+    """
+    target = model_target(
+        output / "model", overwrite=True, inputs=() if start_from is None else (start_from / CONFIG_FILE,)
+    )
+    require_model_or_free(target)
+    begun = any((output / stage / "checkpoint.pt").exists() for stage in STAGES)
+    if not begun and target.folder.is_dir() and any(target.folder.iterdir()):
+        raise ValueError(
+            f"output {output}: there is a model, but no training that made it; choose another folder, or move the "
+            "model away"
+        )
+
+
+def _recipe(preset: str) -> Recipe:
+    if preset not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
+    return PRESETS[preset]
+
+
+def _steps_planned(recipe: Recipe, stage: str) -> int:
+    return {"image-vae": recipe.image_vae_loop, "raymap-vae": recipe.raymap_vae_loop, "dit": recipe.dit_loop}[
+        stage
+    ].steps
+
+
+def _steps_done(folder: Path) -> int:
+    """Steps that the stage's checkpoint has behind it; 0 without one."""
+    path = folder / "checkpoint.pt"
+    complete = path.exists() and (
+        folder.name == "dit" or (folder / "spread.json").exists()
+    )  # killed while measuring its latents
+    return read_state(path, mapped=True)["step"] if complete else 0
+
+
+def _require_positive(**values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not value > 0:
+            raise ValueError(f"{name}: expected a positive number, got {value}")
+
+
+def _device(name: str | None) -> torch.device:
+    """The device asked for, checked before any work; by default the first GPU, or the CPU where there is none."""
+    if name is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {name!r}") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device: {name!r} was asked for, but torch finds no GPU on this machine; use cpu")
+    return device
+
+
+def _say(group: Group, message: str, *values: object) -> None:
+    if group.is_main:
+        _logger.info(message, *values)
+
+
+def _told(stage: str, cost: Cost) -> str:
+    """A stage's cost in one line."""
+    sizes = ", ".join(f"{name} {count / 1e6:.1f} M" for name, count in cost.parameters.items())
+    return (
+        f"{stage}: parameters {sizes}; memory {(cost.weight_bytes + cost.step_bytes) / GIB:.2f} GiB "
+        f"(weights and average {cost.weight_bytes / GIB:.2f}, a step {cost.step_bytes / GIB:.2f}); "
+        f"{cost.steps_per_second:.3g} steps per second, {100 * cost.data_share:.0f} % of the time for data; "
+        f"{cost.flops:.3g} FLOPs per step, {100 * cost.utilisation:.0f} % of what a matrix product reaches here"
+    )
+
+
+@contextlib.contextmanager
+def _progress(stage: str, group: Group) -> Iterator[OnProgress | None]:
+    """A bar where a person watches, a line in the log now and then elsewhere; for the first process only."""
+    if not group.is_main:
+        yield None
+    elif sys.stderr.isatty() and importlib.util.find_spec("rich") is not None:
+        with _bar(stage) as show:
+            yield show
+    else:
+        yield _lines(stage)
+
+
+def _losses(losses: dict[str, float]) -> str:
+    return "  ".join(f"{name} {value:.4g}" for name, value in losses.items())
+
+
+@contextlib.contextmanager
+def _bar(stage: str) -> Iterator[OnProgress]:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[losses]}"),
+    )  # fmt: skip
+    with Progress(*columns) as progress:
+        bar = progress.add_task(stage, total=None, losses="")
+        yield lambda done, total, losses: progress.update(bar, completed=done, total=total, losses=_losses(losses))
+
+
+def _lines(stage: str) -> OnProgress:
+    last_time, last_step = time.monotonic(), None
+
+    def show(done: int, total: int, losses: dict[str, float]) -> None:
+        nonlocal last_time, last_step
+        last_step = done - 1 if last_step is None else last_step
+        passed = time.monotonic() - last_time
+        if passed >= _SECONDS_BETWEEN_LINES or done == total:
+            _logger.info(
+                "%s: step %d of %d, %.3g steps per second, %s",
+                stage,
+                done,
+                total,
+                (done - last_step) / passed,
+                _losses(losses),
+            )
+            last_time, last_step = time.monotonic(), done
+
+    return show

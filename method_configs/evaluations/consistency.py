@@ -1,0 +1,257 @@
+"""``fillerbuster eval consistency``: relative rotation accuracy of films rendered from finished runs (paper, section
+4).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from method_configs.benchmarks.table_files import TableFiles
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fb_core.evaluation.metrics.correspondences import Matcher
+    from fb_core.evaluation.metrics.relative_rotation import PairResult
+    from fb_core.geometry.cameras import Pinholes
+
+TRUE_FILM = "rendered exactly"
+"""Row of the procedural room itself along the same path: what the matcher can reach there."""
+_CURVE_DEGREES = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consistency(TableFiles):
+    """Whether a film of a finished run turns as its cameras do: relative rotation accuracy (RRA) of frames within a
+    second.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, each with config.yml; runs of one method on several captures also get a mean."""
+    path: str = "ellipse"
+    """ellipse (fitted to the captured cameras), orbit, spiral, or a camera path's JSON file in the run's world."""
+    seconds: float = 10.0
+    """Length of the film (a camera path's file has its own)."""
+    fps: float = 24.0
+    """Frames per second; pairs are at most so many frames apart."""
+    pairs: int = 20
+    """Pairs of frames in each film, the same ones for all runs."""
+    size: int = 512
+    """Side of the square frames in pixels."""
+    fov: float | None = 60.0
+    """Field of view in degrees; None takes the captured cameras'."""
+    loftr: Path | None = None
+    """kornia's weights loftr_outdoor.ckpt (the paper's matcher); without them correspondences are SIFT features."""
+    true_film: bool = True
+    """For captures of procedural rooms also judge the room itself, rendered exactly along the same path."""
+
+    def run(self) -> None:
+        """Render the frames that are needed, judge them, report."""
+        from fb_core.evaluation.metrics.correspondences import loftr_matcher, sift_matches
+        from fb_core.evaluation.metrics.relative_rotation import PairResult, accuracy
+        from fb_core.evaluation.results import Report
+
+        self._check()
+        matcher = sift_matches if self.loftr is None else loftr_matcher(self.loftr)
+        report = Report(seed=self.seed)
+        judged: dict[tuple[str, str], list[PairResult]] = {}
+        part = f"RRA: {self.pairs} pairs within a second of {self.fps:g} frames, {self._matcher}, {self.size} pixels"
+        for run in self.runs:
+            found = self._judged(run, matcher)
+            for method, pairs in found["pairs"].items():
+                key = (method, found["capture"])
+                if key not in judged:  # several runs on one room share its true film
+                    judged[key] = [PairResult(**values) for values in pairs]
+                    model = "-" if method == TRUE_FILM else found["model"]
+                    report.rows.append(
+                        {"part": part, "method": method, "capture": key[1], "model": model} | accuracy(judged[key])
+                    )
+        report.rows.extend(means(report.rows))
+        self.publish(report, lambda _, figure: draw(judged, figure, self._matcher))
+
+    @property
+    def _matcher(self) -> str:
+        return "SIFT" if self.loftr is None else "LoFTR"
+
+    def _check(self) -> None:
+        if not self.runs:
+            raise ValueError(
+                "consistency: expected one or more folders of runs, got none; name a folder with config.yml"
+            )
+        if not (self.fps > 0 and self.seconds > 0 and self.size >= 32 and self.pairs >= 1):
+            raise ValueError(
+                "consistency: expected seconds and fps above 0, 32 or more pixels and a pair, "
+                f"got seconds {self.seconds:g}, fps {self.fps:g}, size {self.size}, pairs {self.pairs}"
+            )
+
+    def _judged(self, run: Path, matcher: Matcher) -> dict[str, Any]:
+        """``pairs`` of each method as plain values (the run's and the true film's), the ``capture``'s name, the
+        ``model``'s hash.
+        """
+        from fb_nerfstudio.runs.finished_run import capture_of, identity_of, read_run
+
+        config, state = read_run(run)
+        capture = capture_of(config)
+        options = ("seed", "path", "seconds", "fps", "pairs", "size", "fov", "true_film")
+        asked = (
+            {name: getattr(self, name) for name in options}
+            | identity_of(run, state)
+            | {"matcher": str(self.loftr or "SIFT")}
+        )
+        del state
+        name = scene_name(capture)
+        file = f"{config.method_name}-{name}-{_digest(asked['run'])}"
+        return self.kept(
+            file, asked, lambda: self._measured(run, config.method_name, capture, matcher) | {"capture": name}
+        )
+
+    def _measured(self, run: Path, method: str, capture: Path, matcher: Matcher) -> dict[str, Any]:
+        from fb_nerfstudio.runs.finished_run import load_run, quiet
+
+        with quiet():
+            pipeline = load_run(run)
+            captured = captured_cameras(pipeline)
+        cameras, bank = self.film(captured), pipeline.datamanager.generated_views
+        films = {method: rendered_by(pipeline, cameras)}
+        exact = true_pictures(capture, pipeline, captured, cameras) if self.true_film else None
+        if exact is not None:
+            films[TRUE_FILM] = exact
+        judged = {name: self._judge(pictures, cameras, matcher, f"{name}: pair") for name, pictures in films.items()}
+        return {
+            "pairs": {name: [dataclasses.asdict(pair) for pair in found] for name, found in judged.items()},
+            "model": "-" if bank is None or not len(bank) else bank.origins[0].model_hash[:8],
+        }
+
+    def film(self, captured: list[Pinholes]) -> Pinholes:
+        """The film's cameras in the world of the captured ones."""
+        from fb_core.data.capture.camera_path import read_camera_path
+        from fb_core.geometry.viewpoints.camera_paths import path_cameras
+
+        if self.path.endswith(".json"):
+            return read_camera_path(Path(self.path), size=self.size).cameras
+        return path_cameras(
+            self.path, captured, max(2, round(self.seconds * self.fps)), size=self.size, fov_degrees=self.fov
+        )
+
+    def _judge(
+        self, pictures: Callable[[int], Tensor], cameras: Pinholes, matcher: Matcher, what: str
+    ) -> list[PairResult]:
+        import torch
+        from rich.progress import Progress
+
+        from fb_core.evaluation.metrics.relative_rotation import frame_pairs, judge_pairs
+
+        chosen = frame_pairs(len(cameras), most_apart=max(1, round(self.fps)), count=self.pairs, seed=self.seed)
+        with Progress(transient=True) as bars, torch.no_grad():
+            bar = bars.add_task(what, total=len(chosen))
+            return judge_pairs(
+                pictures, cameras, chosen, matcher, on_pair=lambda done, _: bars.update(bar, completed=done)
+            )
+
+
+def scene_name(capture: Path) -> str:
+    """What a capture is called in tables: its folder, with the one above where that is only called capture."""
+    folder = capture.parent if capture.suffix == ".json" else capture
+    return f"{folder.parent.name}-{folder.name}" if folder.name in ("capture", "data", "nerfstudio") else folder.name
+
+
+def _digest(text: str) -> str:
+    import hashlib
+
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def captured_cameras(pipeline: Any) -> list[Pinholes]:
+    """Of the pictures that the run was trained on, in its world."""
+    from fb_nerfstudio.bridge import to_pinhole_list
+
+    _ = pipeline.datamanager.cached_train  # undistorts, which changes the cameras
+    return to_pinhole_list(pipeline.datamanager.train_dataset.cameras.to("cpu"))
+
+
+def rendered_by(pipeline: Any, cameras: Pinholes) -> Callable[[int], Tensor]:
+    """Frames of the film as the run's splats show them, on the CPU."""
+    from fb_nerfstudio.bridge import to_nerfstudio
+
+    def picture(frame: int) -> Tensor:
+        outputs = pipeline.model.get_outputs_for_camera(
+            to_nerfstudio(cameras[frame].to(dtype_of(pipeline)), pipeline.device)
+        )
+        return outputs["rgb"].detach().float().cpu().movedim(-1, 0).clamp(0, 1)
+
+    return picture
+
+
+def dtype_of(pipeline: Any) -> Any:
+    """Of the numbers that the run's cameras are told in."""
+    return pipeline.datamanager.train_dataset.cameras.camera_to_worlds.dtype
+
+
+def true_pictures(
+    capture: Path, pipeline: Any, captured: Sequence[Pinholes], cameras: Pinholes
+) -> Callable[[int], Tensor] | None:
+    """Frames of the film as the procedural room shows them; None for other captures."""
+    import torch
+
+    from fb_core.data.capture.captures import read_capture
+    from fb_core.data.rooms.ray_caster import render
+    from fb_core.data.rooms.room import FAMILIES, make_room
+    from fb_core.geometry.similarity import Similarity
+
+    content = read_capture(capture)
+    told = content.extra.get("room")
+    if not isinstance(told, dict) or told.get("family") not in FAMILIES or not isinstance(told.get("seed"), int):
+        return None
+    places = {frame.image_path.name: frame.camera for frame in content.frames}
+    names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
+    if any(name not in places for name in names):
+        return None
+    theirs = [(torch.cat([one.rotations for one in side]), torch.cat([one.centers for one in side])) for side in
+              (captured, [places[name] for name in names])]  # fmt: skip
+    to_capture, room = Similarity.between(*theirs), make_room(told["seed"], FAMILIES[told["family"]])
+    return lambda frame: (
+        render(room, to_capture.cameras(cameras[frame]).to(torch.float32), supersample=2).rgb[0].clamp(0, 1)
+    )
+
+
+def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of each method that has several captures: the mean over these, and half the 95 % interval of the share within 5
+    degrees.
+    """
+    from fb_core.evaluation.ablations import interval
+
+    result = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        if len(mine) > 1:
+            mean: dict[str, Any] = {"part": "RRA, mean over captures", "method": method, "captures": len(mine)}
+            for name in ("rra_1", "rra_2", "rra_5", "rra_10", "rra_20", "maa_10", "median_degrees", "failed"):
+                mean[name], half = interval([float(row[name]) for row in mine])
+                if name == "rra_5":
+                    mean["rra_5_interval"] = half
+            result.append(mean)
+    return result
+
+
+def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: str) -> None:
+    """The share of pairs below each threshold, one curve for each method over all its captures."""
+    import numpy as np
+
+    from method_configs.benchmarks.command import _axes, _save
+
+    figure, axes = _axes("share of pairs with a smaller error")
+    limits = np.geomspace(0.1, _CURVE_DEGREES, 200)
+    for method in dict.fromkeys(method for method, _ in judged):
+        errors = np.array([one.error_degrees for key, found in judged.items() if key[0] == method for one in found])
+        axes.plot(limits, [(errors < limit).mean() for limit in limits], label=f"{method} ({len(errors)} pairs)")
+    axes.set_xscale("log")
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
+    axes.legend()
+    _save(figure, path)

@@ -1,0 +1,69 @@
+"""`fillerbuster bench inference`: what is measured, what is reckoned, and the paper's column."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.tiny_models import save_tiny_model
+
+from method_configs.benchmarks import inference as inference_benchmark
+from method_configs.benchmarks.inference import Inference, reckoned_seconds
+
+
+def test_times_are_reckoned_along_a_line():
+    assert reckoned_seconds({2: 5.0, 4: 6.0}, 50) == pytest.approx(4 + 50 * 0.5)
+    assert reckoned_seconds({2: 5.0, 4: 4.9}, 50) == 5.0, "a busy moment makes no negative times"
+    assert reckoned_seconds({2: 5.0, 4: 6.0}, 1) == 5.0
+
+
+def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
+    folder, asked = save_tiny_model(tmp_path / "model"), []
+    real = inference_benchmark.timed
+
+    def counted(model, views, size, steps, seed):
+        asked.append((views, size, steps))
+        return real(model, views, size, steps, seed)
+
+    monkeypatch.setattr(inference_benchmark, "timed", counted)
+    suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
+    files = {name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()}
+    shared = {"model": folder, "views": (1, 4), "sizes": (32,), "device": "cpu", "keep": tmp_path / "kept"}
+    Inference(**shared, steps=(50, 1), **files).run()
+    rows = json.loads(files["json"].read_text())["rows"]
+    few = [(views, 32, steps) for views in (1, 4) for steps in (1, 4, 12)]
+    assert asked == few, "on CPUs few steps are measured, and one before them sets up what is needed"
+    assert [(row["views"], row["steps"], row["how"]) for row in rows] == [
+        (views, steps, "reckoned") for views in (1, 4) for steps in (50, 1)
+    ]
+    assert all(row["seconds"] > 0 and row["paper_a100_seconds"] is None for row in rows)
+    assert all(path.stat().st_size > 100 for path in files.values())
+    Inference(**shared, steps=(24,)).run()
+    assert len(asked) == 6, "what is kept is not measured again"
+    Inference(**shared | {"keep": None, "views": (1,)}, steps=(3,), reckoned=False).run()
+    assert asked[6:] == [(1, 32, 1), (1, 32, 3)]
+
+
+def test_the_papers_column(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(inference_benchmark, "timed", lambda *_: 1.0)
+    model = save_tiny_model(tmp_path / "model")
+    Inference(model=model, device="cpu", json=tmp_path / "table.json").run()
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    assert len(rows) == 16
+    said = {(row["size"], row["views"]): row["paper_a100_seconds"] for row in rows if row["steps"] == 50}
+    assert said[256, 4] == 9 and said[512, 16] == 53 and said[512, 32] == 120
+    assert all(row["paper_a100_seconds"] is None for row in rows if row["steps"] == 24)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"sizes": (100,)}, "multiples of 16 pixels, got 100"),
+        ({"views": ()}, "expected numbers of views"),
+        ({"device": "moon"}, "device: expected one that this machine has"),
+    ],
+)
+def test_bad_options_are_told(options, said):
+    with pytest.raises(ValueError, match=said):
+        Inference(**options).run()

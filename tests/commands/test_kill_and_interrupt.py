@@ -1,0 +1,508 @@
+"""Every command killed (SIGKILL) and interrupted (SIGINT, SIGTERM) at many moments: between changes of files, by the
+clock.
+
+After each: nothing that is believed is half written, nothing is lost but the round or the steps since the last
+checkpoint, and the same command goes on to the files of a run that nothing disturbed, bit for bit, with nothing left
+beside them (but perhaps an empty hidden folder, which the next writer of that file takes away). Ctrl-C is one line and
+exit code 130.
+
+Last run of all: 2026-11-27, up to 163 moments between changes of files and by the clock, and 14 signals more; 24 tests,
+none failed, in 13 minutes on two shared cores (7.7 CPU minutes). Since then, on 2026-11-28, only test_train and, after
+the trial on hidden views had come to be kept (before, 12 of the 31 moments of test_ns_train and 2 of the 12 of
+test_completion_cache lost it),
+test_completion_cache: all moments passed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import torch
+from helpers.processes.contents import content
+from helpers.processes.fork_server import GENERATED, HERE, Ended, ForkServer, Moment
+from helpers.tiny_models import save_tiny_model
+from helpers.tiny_training import TOY_LOOP
+
+from fb_core.data.capture.captures import validate_capture
+from fb_core.data.rooms.room_captures import rooms
+from fb_core.training.run.checkpoints import Checkpoints
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(3600),
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork"),
+]
+KILL, INT, TERM = signal.SIGKILL, signal.SIGINT, signal.SIGTERM
+SIDE, ITERATIONS, AT_STEP = 32, 6, 2
+_FAULTS = ("Traceback", "Exception ignored", "Error:", "core dumped")
+
+
+# ---- what is tried ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A command and what must hold of what it leaves."""
+
+    job: dict[str, Any]
+    """What `ForkServer.run` takes."""
+    prepare: Callable[[Path], None] = lambda folder: None
+    """Makes the folder as it is before the command."""
+    left: Callable[[Path, Ended], None] = lambda folder, ended: None
+    """Asserts what must hold once the command was ended by the signal."""
+    going_on: Callable[[Path], dict[str, Any] | None] | None = None
+    """The job that goes on, None where all is done; by default the same job."""
+    result: Callable[[Path], Any] | None = None
+    """What is compared with an undisturbed run; by default names and content of all files."""
+
+
+def tried(server: ForkServer, root: Path, trial: Trial, moments: Callable[[Ended], Sequence[Moment]]) -> None:
+    """Run it undisturbed, then once for each moment; all moments that fail are told at the end."""
+    result = trial.result or content
+    whole = root / "whole"
+    whole.mkdir(parents=True)
+    trial.prepare(whole)
+    undisturbed = server.run(trial.job, watch=whole)
+    assert undisturbed.code == 0, undisturbed.said
+    expected, failed, count = result(whole), [], 0
+    for moment in moments(undisturbed):
+        folder = root / "disturbed"
+        folder.mkdir()
+        trial.prepare(folder)
+        try:
+            _disturbed(server, folder, trial, moment, expected)
+        except AssertionError as error:
+            failed.append(f"{moment}: {str(error)[:1500]}")
+        count += 1
+        shutil.rmtree(folder)
+    assert not failed, f"{len(failed)} of {count} moments:\n" + "\n".join(failed)
+
+
+def _disturbed(server: ForkServer, folder: Path, trial: Trial, moment: Moment, expected: Any) -> None:
+    result = trial.result or content
+    ended = server.run(trial.job, watch=folder, moment=moment)
+    is_done = ended.code in (0, -moment.signal) and moment.after is not None  # it came too late
+    if not is_done:
+        ended_well(ended, moment)
+    trial.left(folder, ended)
+    job = trial.job if trial.going_on is None else trial.going_on(folder)
+    if job is not None:
+        again = server.run(job, watch=folder)
+        assert again.code == 0, f"going on: {again.said[-1500:]}"
+    found = result(folder)
+    assert found == expected, difference(found, expected)
+
+
+def ended_well(ended: Ended, moment: Moment) -> None:
+    """By the signal: one line and 130 for Ctrl-C, no traceback for any."""
+    expected = -KILL if moment.signal == KILL else 128 + moment.signal
+    assert ended.code == expected, f"code {ended.code}: {ended.said[-1500:]}"
+    if moment.signal != KILL:
+        assert not [fault for fault in _FAULTS if fault in ended.said], ended.said[-1500:]
+    if moment.signal == INT:
+        lines = [line for line in ended.said.splitlines() if "Stopped" in line or "stopped by signal" in line]
+        assert len(lines) == 1, ended.said[-1500:]
+        assert ended.said.rstrip().endswith(lines[0].rstrip()), ended.said[-1500:]
+
+
+def spread(count: int, of: int) -> list[int]:
+    """So many places among 0 ... of - 1, evenly, with the first and the last."""
+    return sorted({round(index * (of - 1) / max(1, count - 1)) for index in range(count)})
+
+
+def moments(*, kill: int, interrupt: int, term: int = 0, timed: int = 0) -> Callable[[Ended], list[Moment]]:
+    """Before so many changes of files each, and after ``timed`` shares of the time, for SIGKILL and SIGINT each."""
+
+    def of(whole: Ended) -> list[Moment]:
+        counts = {KILL: kill, INT: interrupt, TERM: term}
+        events = [
+            Moment(signal=number, event=event)
+            for number, count in counts.items()
+            for event in spread(count, whole.events)
+            if count
+        ]
+        shares = [(index + 0.5) / timed * 0.8 for index in range(timed)]
+        return events + [
+            Moment(signal=number, after=share * whole.seconds) for share in shares for number in (KILL, INT)
+        ]
+
+    return of
+
+
+# ---- what is compared ------------------------------------------------------------------------------------------------
+
+
+def difference(found: Any, expected: Any) -> str:
+    if not isinstance(found, dict) or not isinstance(expected, dict):
+        return "another result"
+    told = [f"{name} is left" for name in found if name not in expected] + [
+        f"{name} is missing" for name in expected if name not in found
+    ]
+    return "; ".join(
+        told + [f"{name} is another" for name in found if name in expected and found[name] != expected[name]]
+    )
+
+
+# ---- inputs ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A capture and a model."""
+    folder = tmp_path_factory.mktemp("inputs")
+    rooms(3, folder / "room", family="narrow", views=6, size=SIDE, held_out=2, ground_truth=False)
+    return folder / "room", save_tiny_model(folder / "model", image_size=SIDE)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkServer]:
+    running = ForkServer(tmp_path_factory.mktemp("server"))
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def run(server: ForkServer, inputs: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of ns-train."""
+    folder = tmp_path_factory.mktemp("run")
+    ended = server.run(ns_train(inputs, folder), watch=folder)
+    assert ended.code == 0, ended.said
+    return run_folder(folder)
+
+
+# ---- fillerbuster train ----------------------------------------------------------------------------------------------
+
+
+def test_train(server: ForkServer, tmp_path: Path):
+    trial = Trial(
+        job={"argv": ["train", "toy", "--output", "out", "--device", "cpu", "--keep", "2"]}, left=_training_left
+    )
+    tried(server, tmp_path, trial, moments(kill=12, interrupt=7, term=3, timed=3))
+
+
+def _training_left(folder: Path, ended: Ended) -> None:
+    """Checkpoints are whole, and no more steps are lost than lie between two; none where the signal was noted."""
+    for stage in (folder / "out").glob("*/log.jsonl"):
+        steps = [json.loads(line)["step"] for line in stage.read_text().splitlines() if line.endswith("}")]
+        newest = Checkpoints(stage.parent, 2).find()
+        saved = 0 if newest is None else torch.load(newest, weights_only=True)["step"]
+        assert max(steps, default=0) - saved <= TOY_LOOP.save_every, f"{stage.parent.name}: {steps} done, {saved} saved"
+        if f"{stage.parent.name} stopped by signal" in ended.said:
+            assert max(steps) == saved
+
+
+# ---- ns-train --------------------------------------------------------------------------------------------------------
+
+
+def ns_train(inputs: tuple[Path, Path], folder: Path, timestamp: str = "run", **options: Any) -> dict[str, Any]:
+    shared = {
+        "data": inputs[0],
+        "model": inputs[1],
+        "output": folder / "out",
+        "iterations": ITERATIONS,
+        "at_step": AT_STEP,
+    }
+    return {"ns_train": {name: str(value) if isinstance(value, Path) else value for name, value in shared.items()}
+            | {"timestamp": timestamp} | options}  # fmt: skip
+
+
+def run_folder(folder: Path, timestamp: str = "run") -> Path:
+    return folder / "out" / "room" / "fillerbuster" / timestamp
+
+
+def kept_passes(checkpoint: Path) -> int:
+    """Rounds of views, and the trial on hidden views."""
+    state = torch.load(checkpoint, weights_only=True)["pipeline"]["datamanager._extra_state"]
+    views = state["views"]
+    return (state["trust"] is not None) + (
+        0 if views is None else len({origin["round"] for origin in views["origins"]})
+    )
+
+
+def checkpoints(run: Path) -> list[Path]:
+    return sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
+
+
+def trained(run: Path) -> dict[str, str]:
+    """Names of all files, and every tensor of the last checkpoint."""
+    found, last = content(run), checkpoints(run)[-1]
+    found = {name: digest for name, digest in found.items() if not name.endswith(".ckpt")}  # earlier ones may be left
+    return found | {last.name: tensors(torch.load(last, weights_only=True))}
+
+
+def tensors(state: Any) -> str:
+    """A digest of all tensors and values, in order."""
+    digest = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, torch.Tensor):
+            digest.update(str(value.dtype).encode() + value.contiguous().numpy().tobytes())
+        elif isinstance(value, dict):
+            for key, one in value.items():
+                digest.update(str(key).encode())
+                add(one)
+        elif isinstance(value, list | tuple):
+            for one in value:
+                add(one)
+        else:
+            digest.update(repr(value).encode())
+
+    add(state)
+    return digest.hexdigest()
+
+
+def test_ns_train(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
+    """Before, during and after the generation, and while checkpoints are written; it goes on with --load-dir.
+
+    Each pass of the model counts: the trial on hidden views, and every round.
+    """
+    first = ns_train(inputs, Path("."))
+
+    def left(folder: Path, ended: Ended) -> None:
+        known = max((kept_passes(path) for path in checkpoints(run_folder(folder))), default=0)
+        assert ended.said.count(GENERATED) - known <= 1, f"{ended.said.count(GENERATED)} passes generated, {known} kept"
+        if (views := run_folder(folder) / "completion").exists():
+            validate_capture(views, decode=True)
+
+    def going_on(folder: Path) -> dict[str, Any] | None:
+        there = checkpoints(run_folder(folder))
+        if not there:
+            return first
+        done = int(there[-1].stem.removeprefix("step-")) + 1
+        return (
+            None
+            if done == ITERATIONS
+            else ns_train(inputs, Path("."), iterations=ITERATIONS - done, load_dir=str(there[-1].parent))
+        )
+
+    trial = Trial(job=first, left=left, going_on=going_on, result=lambda folder: trained(run_folder(folder)))
+    tried(server, tmp_path, trial, moments(kill=14, interrupt=8, term=3, timed=3))
+
+
+def test_completion_cache(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
+    """A run that begins anew finds every round that was kept, and the trial on hidden views, and makes the same
+    views.
+    """
+    first = ns_train(inputs, Path("."), cache="cache")
+
+    def kept(folder: Path) -> list[Path]:
+        return [
+            path
+            for path in (folder / "cache").rglob("*.safetensors")
+            if not path.name.startswith(".") and path.parent.name in path.name
+        ]
+
+    def left(folder: Path, ended: Ended) -> None:
+        assert ended.said.count(GENERATED) - len(kept(folder)) <= 1
+
+    def going_on(folder: Path) -> dict[str, Any]:
+        shutil.rmtree(folder / "out", ignore_errors=True)
+        return first
+
+    trial = Trial(
+        job=first,
+        left=left,
+        going_on=going_on,
+        result=lambda folder: content(folder / "cache") | trained(run_folder(folder)),
+    )
+    tried(server, tmp_path, trial, moments(kill=8, interrupt=4))
+
+
+# ---- commands that write a folder ------------------------------------------------------------------------------------
+
+
+def writes_a_folder(argv: Sequence[object], *, earlier: Path | None = None) -> Trial:
+    """A command that makes the folder ``out``, whole or not at all, from nothing or in the place of an ``earlier`` one.
+
+    ``out`` is at every moment what was there before, or what the command makes; the command again leaves that alone.
+    """
+    known: list[Any] = []
+
+    def prepare(folder: Path) -> None:
+        if earlier is not None:
+            shutil.copytree(earlier, folder / "out")
+
+    def left(folder: Path, ended: Ended) -> None:
+        there = content(folder / "out") if (folder / "out").exists() else None
+        before = None if earlier is None else content(earlier)
+        assert there in (before, known[0]), f"out is neither old nor new: {difference(there or {}, known[0])}"
+
+    def going_on(folder: Path) -> dict[str, Any]:
+        if earlier is None:
+            shutil.rmtree(folder / "out", ignore_errors=True)  # what is there is refused, and was seen to be whole
+        return job
+
+    def result(folder: Path) -> dict[str, str]:
+        if not known:
+            known.append(content(folder / "out"))
+        return content(folder)
+
+    job = {"argv": [str(one) for one in argv]}
+    return Trial(job=job, prepare=prepare, left=left, going_on=going_on, result=result)
+
+
+def made(server: ForkServer, folder: Path, *argv: object) -> Path:
+    """An earlier output of a command."""
+    folder.mkdir()
+    ended = server.run({"argv": [*map(str, argv), "--output", "out"]}, watch=folder)
+    assert ended.code == 0, ended.said
+    return folder / "out"
+
+
+def complete_arguments(inputs: tuple[Path, Path], views: int) -> list[object]:
+    return [
+        "complete",
+        inputs[0],
+        "--model",
+        inputs[1],
+        "--views",
+        views,
+        "--steps",
+        2,
+        "--no-check",
+        "--device",
+        "cpu",
+    ]
+
+
+def test_complete(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
+    trial = writes_a_folder([*complete_arguments(inputs, 3), "--output", "out"])
+    tried(server, tmp_path, trial, moments(kill=7, interrupt=5, term=2, timed=4))
+
+
+def test_complete_in_the_place_of_an_earlier_output(server: ForkServer, inputs: tuple[Path, Path], tmp_path: Path):
+    earlier = made(server, tmp_path / "earlier", *complete_arguments(inputs, 2))
+    trial = writes_a_folder([*complete_arguments(inputs, 3), "--output", "out", "--overwrite"], earlier=earlier)
+    tried(server, tmp_path, trial, moments(kill=8, interrupt=4))
+
+
+@pytest.mark.parametrize("format", ["nerfstudio", "colmap"])
+def test_export(server: ForkServer, run: Path, tmp_path: Path, format: str):
+    argv = ["export", run, "--format", format]
+    earlier = made(server, tmp_path / "earlier", *argv, "--no-held-out") if format == "colmap" else None
+    trial = writes_a_folder([*argv, "--output", "out", *(() if earlier is None else ["--overwrite"])], earlier=earlier)
+    tried(server, tmp_path, trial, moments(kill=8, interrupt=4, term=1))
+
+
+def test_convert(server: ForkServer, shared_path: Callable[[str], Path], tmp_path: Path):
+    trial = writes_a_folder(["convert", shared_path("golden/reference"), "--output", "out"])
+    tried(server, tmp_path, trial, moments(kill=9, interrupt=3, timed=1))
+
+
+def test_rooms(server: ForkServer, tmp_path: Path):
+    trial = writes_a_folder(["rooms", "--output", "out", "--views", 4, "--size", 32, "--held-out", 2])
+    tried(server, tmp_path, trial, moments(kill=4, interrupt=2, timed=2))
+
+
+def test_sheet(server: ForkServer, run: Path, tmp_path: Path):
+    trial = Trial(job={"argv": ["sheet", str(run), "--output", "out/sheet.png"]})
+    tried(server, tmp_path, trial, moments(kill=4, interrupt=2, timed=1))
+
+
+# ---- commands that leave no files, and whole processes --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.5])
+def test_bench(server: ForkServer, tmp_path: Path, seconds: float):
+    moment = Moment(signal=INT, after=seconds)
+    ended_well(server.run({"argv": ["bench", "poses"]}, watch=tmp_path, moment=moment), moment)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [INT, TERM])
+def test_demo_takes_its_trainings_along(server: ForkServer, tmp_path: Path, number: int):
+    moment = Moment(signal=number, after=12.0)
+    ended = server.run({"argv": ["demo", "--output", "out", "--iterations", "100000"]}, watch=tmp_path, moment=moment)
+    ended_well(ended, moment)
+    assert (tmp_path / "out" / "runs").is_dir(), "it was not training yet"
+    left = [
+        one
+        for one in psutil.process_iter(["cmdline"])
+        if any(str(tmp_path) in part for part in one.info["cmdline"] or ())
+    ]
+    assert not left
+
+
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+left = int(sys.argv.pop(1))
+def hook(event, arguments):
+    global left
+    if event == "import":
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+from fb_core.machine import interruption
+from method_configs.entrance import main
+sys.addaudithook(hook)
+main()
+"""
+
+
+@pytest.mark.parametrize("number", [5, 120, 400, 700, 1000, 1300, 1700, 2100])
+def test_imports_are_never_left_half_done(inputs: tuple[Path, Path], tmp_path: Path, number: int):
+    """In a process of its own, before its N-th import: modules swallow an error there, or stay half imported."""
+    command = [
+        sys.executable,
+        "-c",
+        INTERRUPTED_IMPORT,
+        str(number),
+        *map(str, complete_arguments(inputs, 3)),
+        "--output",
+        "out",
+    ]
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "CUDA_VISIBLE_DEVICES": ""}
+    child = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert child.returncode == 128 + INT and child.stdout == "" and child.stderr.splitlines()[-1] == "Stopped.", (
+        child.stderr[-1500:]
+    )
+    assert not [fault for fault in _FAULTS if fault in child.stderr] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("phrase", ["Saving config to", "Completing the scene"])
+def test_ns_train_itself_ends_in_one_line(inputs: tuple[Path, Path], tmp_path: Path, phrase: str):
+    """The whole process with its command line: as soon as it has read that, and while it generates."""
+    script = Path(sys.executable).with_name("ns-train")
+    options = {
+        "data": inputs[0],
+        "output-dir": tmp_path,
+        "vis": "tensorboard",
+        "machine.device-type": "cpu",
+        "pipeline.datamanager.completion.at-step": 0,
+        "pipeline.datamanager.completion.model": inputs[1],
+        "pipeline.datamanager.completion.steps": 400,
+    }
+    command = [
+        str(script),
+        "fillerbuster",
+        *(str(part) for name, value in options.items() for part in (f"--{name}", value)),
+    ]
+    environment = os.environ | {
+        "PYTHONPATH": str(HERE.parent),
+        "CUDA_VISIBLE_DEVICES": "",
+        "PYTHONUNBUFFERED": "1",
+        "COLUMNS": "1000",
+    }
+    with (
+        (tmp_path / "log").open("w") as log,
+        subprocess.Popen(command, stdout=log, stderr=log, env=environment) as child,
+    ):
+        until = time.monotonic() + 300
+        while phrase not in (tmp_path / "log").read_text() and child.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        child.send_signal(INT)
+        code = child.wait(timeout=120)
+    ended_well(Ended(code=code, seconds=0, events=0, said=(tmp_path / "log").read_text()), Moment(signal=INT, after=0))
