@@ -9,10 +9,7 @@ import os
 import signal
 import sys
 
-from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
-
-DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
-"""Environment variable that, set to anything, shows the traceback of an error."""
+from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, stop_on_signals
 
 
 def main() -> None:

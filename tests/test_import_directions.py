@@ -1,4 +1,4 @@
-"""The rooms and who may import whom (docs/architecture.md): walked in the source, and tried in fresh interpreters."""
+"""The folders and who may import whom (docs/architecture.md): walked in the source, and tried in fresh interpreters."""
 
 from __future__ import annotations
 
@@ -11,27 +11,45 @@ from pathlib import Path
 REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGES = ("fb_core", "fb_nerfstudio", "method_configs")
 
-# From left to right: a module may import its own floor and the floors before it.
+# From first to last: a module may import its own line and those before it, whether at import time or in a function.
 FLOORS = (
-    (
-        *(
-            "fb_core.files",
-            "fb_core.machine",
-            "fb_core.files.limits",
-            "fb_core.files.json_files",
-            "fb_core.machine.interruption",
-        ),
-        *("fb_core.geometry", "fb_core.networks", "fb_core.masks"),
-    ),
-    ("fb_core.views", "fb_core.conditioning", "fb_core.flow", "fb_core.sampling", "fb_core.sampling"),
-    ("fb_core.inpainter", "fb_core.checkpoint", "fb_core.memory", "fb_core.memory.live_bytes"),
-    (
-        *("fb_core.data", "fb_core.training", "fb_core.evaluation"),
-        *("fb_core.registration", "fb_core.registration.by_raymaps", "fb_core.registration.by_features"),
-        *("fb_core.completion.fly_through", "fb_core.completion.duration"),
-    ),
-    ("fb_nerfstudio",),
-    ("method_configs",),
+    "fb_core.machine",
+    "fb_core.files",
+    "fb_core.masks",
+    "fb_core.geometry",
+    "fb_core.networks",
+    "fb_core.views",
+    "fb_core.conditioning",
+    "fb_core.flow",
+    "fb_core.sampling",
+    "fb_core.checkpoint",
+    "fb_core.memory",
+    "fb_core.inpainter",
+    "fb_core.splatting",
+    "fb_core.data",
+    "fb_core.registration",
+    "fb_core.completion",
+    "fb_core.evaluation",
+    "fb_core.training",
+    "fb_nerfstudio.earlier_names",
+    "fb_nerfstudio.bridge",
+    "fb_nerfstudio.splats",
+    "fb_nerfstudio.capture",
+    "fb_nerfstudio.refusal",
+    "fb_nerfstudio.viewer",
+    "fb_nerfstudio.generation",
+    "fb_nerfstudio.trainer",
+    "fb_nerfstudio.datamanager",
+    "fb_nerfstudio.runs",
+    "method_configs.environment",
+    "method_configs.presets",
+    "method_configs.splats",
+    "method_configs.room_runs",
+    "method_configs.benchmarks",
+    "method_configs.evaluations",
+    "method_configs.commands",
+    "method_configs.train",
+    "method_configs.entrance",
 )
 NEVER_IN_CORE = {"nerfstudio", "gsplat", "viser"}
 HEAVY = {
@@ -47,7 +65,7 @@ HEAVY = {
     "torchvision",
 }
 CORE_NEEDS = {"torch", "numpy", "einops", "safetensors", "jaxtyping"}
-CORE = (*FLOORS[0], *FLOORS[1], *FLOORS[2], "fb_core.training")
+CORE = (*FLOORS[: FLOORS.index("fb_core.splatting") + 1], "fb_core.training")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +86,8 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def is_within(module: str, room: str) -> bool:
-    return module == room or module.startswith(room + ".")
+def is_within(module: str, package: str) -> bool:
+    return module == package or module.startswith(package + ".")
 
 
 def is_type_checking(node: ast.AST) -> bool:
@@ -125,7 +143,7 @@ IMPORTS = all_imports()
 
 
 def floor_of(module: str) -> int | None:
-    return next((number for number, rooms in enumerate(FLOORS) if any(is_within(module, room) for room in rooms)), None)
+    return next((number for number, package in enumerate(FLOORS) if is_within(module, package)), None)
 
 
 def told(faults: list[Import]) -> str:
@@ -133,7 +151,9 @@ def told(faults: list[Import]) -> str:
 
 
 def test_every_module_has_its_floor() -> None:
-    modules = {module_name(path) for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")} - {"fb_core"}
+    modules = {module_name(path) for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")} - set(
+        PACKAGES
+    )
     homeless = sorted(module for module in modules if floor_of(module) is None)
     assert not homeless, f"name their floor in this test and in docs/architecture.md: {homeless}"
 
@@ -147,9 +167,64 @@ def test_imports_go_one_way() -> None:
     assert not faults, told(faults)
 
 
-def test_the_package_itself_imports_none_of_its_rooms() -> None:
-    faults = [one for one in IMPORTS if one.importer == "fb_core" and one.imported.split(".")[0] in PACKAGES]
+def circles_of(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Modules that lead back to themselves, each circle once (Tarjan's strongly connected components)."""
+    order: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(module: str) -> None:
+        order[module] = lowest[module] = len(order)
+        stack.append(module)
+        for other in imports.get(module, ()):
+            if other not in order:
+                visit(other)
+                lowest[module] = min(lowest[module], lowest[other])
+            elif other in stack:
+                lowest[module] = min(lowest[module], order[other])
+        if lowest[module] == order[module]:
+            start = stack.index(module)
+            circle = stack[start:]
+            del stack[start:]
+            if len(circle) > 1 or module in imports.get(module, ()):
+                found.append(sorted(circle))
+
+    for module in sorted(imports):
+        if module not in order:
+            visit(module)
+    return found
+
+
+def test_imports_run_in_no_circle() -> None:
+    """Neither at import time, nor in a function, nor for types alone. A package's door (its __init__) leads inwards."""
+    doors = {module_name(path.parent / "__init__.py") for top in PACKAGES for path in (REPOSITORY / top).rglob("*.py")}
+    imports: dict[str, set[str]] = {}
+    for one in IMPORTS:
+        if one.imported.split(".")[0] in PACKAGES and one.importer not in doors:
+            imports.setdefault(one.importer, set()).add(one.imported)
+    assert circles_of(imports) == []
+
+
+def test_circles_are_found() -> None:
+    """The test's own test."""
+    assert circles_of({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}}) == [["a", "b", "c"]]
+    assert circles_of({"a": {"b"}, "b": {"c"}, "d": {"d"}}) == [["d"]]
+
+
+def test_the_package_itself_imports_none_of_its_parts_before_they_are_asked_for() -> None:
+    faults = [
+        one
+        for one in IMPORTS
+        if one.importer == "fb_core" and one.imported.split(".")[0] in PACKAGES and one.at_import_time
+    ]
     assert not faults, told(faults)
+
+
+def test_public_names_are_there() -> None:
+    import fb_core
+
+    assert all(getattr(fb_core, name).__name__ == name for name in fb_core.__all__)
 
 
 def test_core_never_knows_nerfstudio() -> None:
@@ -168,7 +243,7 @@ def test_sampling_and_training_need_little() -> None:
         one
         for one in IMPORTS
         if one.at_import_time
-        and any(is_within(one.importer, room) for room in CORE)
+        and any(is_within(one.importer, package) for package in CORE)
         and one.imported.split(".")[0] not in allowed
     ]
     assert not faults, told(faults)

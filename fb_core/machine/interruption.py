@@ -16,6 +16,8 @@ from typing import Any, NoReturn
 
 ENDED_BY_USER = 128 + signal.SIGINT
 """Exit code of a command that Ctrl-C has ended, as shells report it."""
+DEBUG_VARIABLE = "FILLERBUSTER_DEBUG"
+"""Environment variable that, set to anything, shows the traceback of an error."""
 _LATER_SECONDS = 0.05
 
 

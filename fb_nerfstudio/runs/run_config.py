@@ -17,6 +17,8 @@ from typing import Any
 
 import yaml
 
+from fb_nerfstudio.earlier_names import EARLIER_NAMES
+
 _PARSERS = "nerfstudio.data.dataparsers"
 ALLOWED: dict[str, tuple[str, ...]] = {
     "fb_nerfstudio.trainer": ("FillerbusterTrainerConfig", "FillerbusterTrainer"),
@@ -103,6 +105,7 @@ class _Loader(yaml.SafeLoader):
 def _named(tag: str, name: str) -> type:
     """A class on the list; nothing is imported for any other name."""
     module, _, own = name.rpartition(".")
+    module = EARLIER_NAMES.get(module, module)
     if own not in ALLOWED.get(module, ()):
         raise _Refused(f"the tag {tag!r} names what is no part of a fillerbuster run")
     found = vars(importlib.import_module(module)).get(own)

@@ -89,9 +89,10 @@ class Inference(TableFiles):
         for steps in self.steps:
             value = reckoned_seconds(seconds, steps) if reckoned else seconds[steps]
             paper = PAPER_SECONDS.get(size, {}).get(views) if steps == _PAPER_STEPS else None
+            preset = model.info.get("preset", "the model")
             rows.append(
                 {
-                    "part": f"inference with {model.info.get('preset', 'the model')} ({model.model_hash[:8]}), half of the views known",
+                    "part": f"inference with {preset} ({model.model_hash[:8]}), half of the views known",
                     "size": size, "views": views, "steps": steps, "seconds": value,
                     "how": "reckoned" if reckoned else "measured",
                     "device": str(model.device), "parameters": sum(weight.numel() for weight in model.dit.parameters()),

@@ -253,8 +253,8 @@ def _saving_rows(cell: _Cell, runs: int) -> list[dict[str, Any]]:
     for name, job in variants.items():
         rows.append(
             {"part": "saving", "views": len(cell.noise), "size": cell.images.shape[-1], "saving": name,
-            "step_seconds": seconds[name],
-             "ratio_to_previous": before / seconds[name], "relative_difference": relative_difference(job(), wanted)}
+             "step_seconds": seconds[name], "ratio_to_previous": before / seconds[name],
+             "relative_difference": relative_difference(job(), wanted)}
         )  # fmt: skip
         before = seconds[name]
     return rows

@@ -17,7 +17,7 @@ import tyro
 
 from fb_core.files.faults import sentence_of
 from fb_core.files.ownership import require_own_or_new
-from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
+from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, stop_on_signals
 from method_configs.benchmarks.builds import Builds
 from method_configs.benchmarks.command import Networks, Precision
 from method_configs.benchmarks.fit import Fit
@@ -26,7 +26,6 @@ from method_configs.benchmarks.methods import Methods
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
-from method_configs.entrance import DEBUG_VARIABLE
 from method_configs.evaluations.ablations import Ablations
 from method_configs.evaluations.conditioning import Conditioning
 from method_configs.evaluations.consistency import Consistency

@@ -418,9 +418,8 @@ def test_a_rig_s_pictures_of_one_name_are_told_apart_by_what_they_hold(tmp_path:
 
     truth = cameras_on_an_arc(4)
     rig = write_capture(tmp_path / "rig", [
-        FrameToWrite(name=f"p{index}", image=torch.full((3, 16, 16), index / 8),
-        camera=truth[index].scaled(16, 16).to(torch.float64))
-        for index in range(4)
+        FrameToWrite(name=f"p{index}", image=torch.full((3, 16, 16), index / 8), camera=camera)
+        for index, camera in enumerate(truth[one].scaled(16, 16).to(torch.float64) for one in range(4))
     ])  # fmt: skip
     meta = json.loads((rig.root / "transforms.json").read_text())
     (tmp_path / "photos").mkdir()

@@ -133,9 +133,8 @@ def trajectories(dice: Dice) -> Any:
     slope = dice.normal(count, 32, 2, 2).to(state)
     times = time_grid(dice.number(1, 9), shift=dice.of(1.0, 2.0), grid=dice.of(*GRIDS))
     window, rounds = dice.bad(dice.of(None, 1, 2, 3, 9), 0, -1), dice.bad(dice.of(1, 2), 0)
-    predict = tiled(lambda part, time, views: torch.stack([slope if views is None else slope[views]]), window=window,
-    rounds=rounds,
-                    orders=random_orders(dice.number(0, 9)))  # fmt: skip
+    slopes = lambda part, time, views: torch.stack([slope if views is None else slope[views]])  # noqa: E731
+    predict = tiled(slopes, window=window, rounds=rounds, orders=random_orders(dice.number(0, 9)))
     field: Callable = lambda z, time: predict(z, time, None)[0]  # noqa: E731
     if dice.chance(0.3):
         field = imposed(field, state.double(), slope.double(), dice.mask(count, 32, 2, 2), until=dice.of(-1.0, 0.5))

@@ -22,9 +22,10 @@ from fb_core.data.capture.frames import Frame
 from fb_core.data.capture.layouts import layout_of
 from fb_core.data.capture.own_files import lies_inside
 from fb_core.data.photos import video
+from fb_core.data.photos.choice import choose_by_coverage
 from fb_core.data.photos.exif import read_exif
 from fb_core.data.photos.panoramas import around_fault, goes_on_at_its_edge, panorama_fault
-from fb_core.data.photos.photo import Photo, Pixels, _shrunk
+from fb_core.data.photos.photo import Photo, Pixels, shrunk
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".exr", ".bmp", *media.HEIF_SUFFIXES)
 THUMBNAIL_SIDE = 96
@@ -64,8 +65,6 @@ def read_photos(source: Path, *, most: int | None = None) -> list[Photo]:
         ) from error
     if most is None or len(photos) <= most:
         return photos
-    from fb_core.data.photos.choice import choose_by_coverage  # which chooses among photos
-
     return [photos[index] for index in choose_by_coverage(photos, most)]
 
 
@@ -117,7 +116,7 @@ def _still(path: Path, name: str) -> Photo:
         device=f"{exif.lens} {max(size)} x {min(size)}" if exif.lens else "",
         seconds=exif.seconds,
         camera=None,
-        thumbnail=_shrunk((image, mask), THUMBNAIL_SIDE)[0],
+        thumbnail=shrunk((image, mask), THUMBNAIL_SIDE)[0],
         pixels=pixels,
     )
 
@@ -163,7 +162,7 @@ def _captured(frame: Frame, name: str, *, root: Path) -> Photo:
         device="capture " + " ".join(f"{value:g}" for value in intrinsics),
         seconds=None,
         camera=camera,
-        thumbnail=_shrunk((image, mask), THUMBNAIL_SIDE)[0],
+        thumbnail=shrunk((image, mask), THUMBNAIL_SIDE)[0],
         pixels=pixels,
     )
 

@@ -64,10 +64,10 @@ class Photo:
         """:meth:`load` and :meth:`load_mask` with one decoding. Raises ValueError for a file that has become
         unreadable.
         """
-        return _shrunk(self.pixels(), longest_side)
+        return shrunk(self.pixels(), longest_side)
 
 
-def _shrunk(pixels: Pixels, longest_side: int | None) -> tuple[Float[Tensor, "3 h2 w2"], Float[Tensor, "1 h2 w2"]]:
+def shrunk(pixels: Pixels, longest_side: int | None) -> tuple[Float[Tensor, "3 h2 w2"], Float[Tensor, "1 h2 w2"]]:
     """Area averages of the known pixels; where nothing is known the colour is black."""
     image, mask = pixels
     if bool((mask == 1).all()):

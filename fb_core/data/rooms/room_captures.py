@@ -306,7 +306,9 @@ def rooms(
     capture = casual_capture(seed, family=family, views=views, size=size, held_out=held_out)
     write_room_capture(capture, Path(output), ground_truth=ground_truth)
     covered = int(capture.covered.sum())
-    _log.info("room %d (%s): %d captured views, %d covered and %d uncovered held-out views, %d points", seed, family,
-    views,
-              covered, len(capture.covered) - covered, len(capture.points))  # fmt: skip
+    held_out_counts = (covered, len(capture.covered) - covered)
+    _log.info(
+        "room %d (%s): %d captured views, %d covered and %d uncovered held-out views, %d points",
+        *(seed, family, views, *held_out_counts, len(capture.points)),
+    )
     _log.info("written to %s in %.1f s", output, time.perf_counter() - start)

@@ -7,7 +7,7 @@ precision.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,10 +17,8 @@ from torch import Tensor, nn
 
 from fb_core.networks.transformer.attention import EPS, Attention, KeysValues, RMSNorm
 from fb_core.networks.transformer.embeddings import at_least_float32
+from fb_core.networks.transformer.known_tokens import Relation
 from fb_core.networks.transformer.ray_frames import RayFrames
-
-if TYPE_CHECKING:
-    from fb_core.networks.transformer.known_tokens import Relation
 
 
 class LayerNorm(nn.Module):

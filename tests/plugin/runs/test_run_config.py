@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.plugins.registry import discover_methods
 
+from fb_nerfstudio.earlier_names import EARLIER_NAMES
 from fb_nerfstudio.runs.run_config import ALLOWED, read_run_config
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs.commands import command_line as commands
@@ -51,6 +52,25 @@ def test_options_of_every_method_are_read_as_by_nerfstudio(tmp_path: Path, name:
     )
 
 
+@pytest.mark.parametrize("name", ["fillerbuster", "fillerbuster-masked"])
+def test_runs_of_earlier_versions_open_under_todays_names(tmp_path: Path, name: str):
+    """By our reader and by nerfstudio's own, which imports the modules that a config.yml names."""
+    config = copy.deepcopy(OURS[name])
+    text = yaml.dump(config)
+    for earlier, today in EARLIER_NAMES.items():
+        text = text.replace(f":{today}.", f":{earlier}.")
+    assert text.count("fb_nerfstudio.completion_config.") and "fb_core" not in text
+    (tmp_path / "config.yml").write_text(text)
+    assert read_run_config(tmp_path / "config.yml") == config == yaml.load(text, Loader=yaml.Loader)
+
+
+def test_earlier_names_lead_to_modules_that_are_there():
+    for earlier, today in EARLIER_NAMES.items():
+        assert importlib.import_module(earlier) is importlib.import_module(today)
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("fb_nerfstudio.no_such_module")
+
+
 @pytest.mark.parametrize("parser", [ColmapDataParserConfig, BlenderDataParserConfig])
 def test_other_readers_of_captures_are_part_of_a_run(tmp_path: Path, parser: type):
     config = copy.deepcopy(fillerbuster.config)
@@ -81,7 +101,8 @@ def attacks(marker: Path) -> dict[str, str]:
         "a call of an allowed class": f"{PYTHON}object/apply:nerfstudio.utils.writer.LocalWriter [{{}}]",
         "a call of options": f"{PYTHON}object/apply:nerfstudio.configs.base_config.MachineConfig []",
         "an instance of no options": f"{PYTHON}object:nerfstudio.utils.writer.LocalWriter {{}}",
-        "a reader that unpickles": f"{PYTHON}object:nerfstudio.data.dataparsers.minimal_dataparser.MinimalDataParserConfig {{data: x}}",
+        "a reader that unpickles": f"{PYTHON}object:nerfstudio.data.dataparsers.minimal_dataparser."
+        "MinimalDataParserConfig {data: x}",
         "a method replaced by a value": f"{PYTHON}object:nerfstudio.configs.base_config.MachineConfig {{__class__: 1}}",
         "a member that is none": f"{PYTHON}object/apply:nerfstudio.utils.writer.EventName [{{}}]",
         "a path of other things": f"{PYTHON}object/apply:pathlib.PosixPath [[{marker}]]",

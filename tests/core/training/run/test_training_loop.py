@@ -265,9 +265,10 @@ for name in {[*HEAVY, "tensorboard"]!r}:
     sys.modules[name] = None
 sys.path.insert(0, {str(ROOT / "tests")!r})
 from helpers.tiny_training import TOY
-from method_configs import presets as ablations, train
-ablations.PRESETS["toy"] = TOY
-train.main(["toy", "--output", {str(tmp_path)!r}, "--device", "cpu", "--sheet-every", "2", "--tensorboard", "--no-half"])
+from method_configs import presets, train
+presets.PRESETS["toy"] = TOY
+options = ["--device", "cpu", "--sheet-every", "2", "--tensorboard", "--no-half"]
+train.main(["toy", "--output", {str(tmp_path)!r}, *options])
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
