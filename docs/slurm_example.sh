@@ -21,7 +21,8 @@ srun torchrun --nnodes "$SLURM_NNODES" --nproc-per-node 8 \
     -m method_configs.train "$preset" --output "$output" --precision bfloat16
 status=$?
 
-# Ended by the time limit, not by an error: the same job again, which goes on from the checkpoint. (Preempted jobs are queued again by Slurm itself.)
+# Ended by the time limit, not by an error: the same job again, which goes on from the checkpoint. (Preempted jobs are
+# queued again by Slurm itself.)
 if [ "$status" -ne 0 ] && [ "$SECONDS" -ge $((12 * 3600 - 300)) ]; then
     scontrol requeue "$SLURM_JOB_ID"
 fi

@@ -1,9 +1,12 @@
 #!/usr/bin/env bash
 # OpenImageIO 3.0.21.0 (Python wheel), writing a PNG where the device has no room left.
-# Input: 600 x 600 pixels of RGB noise, 8 bits; the file is a link to /dev/full, which refuses every byte as a full disk does.
+# Input: 600 x 600 pixels of RGB noise, 8 bits; the file is a link to /dev/full, which refuses every byte as a full disk
+#   does.
 # Expected: write_image or close is false, as their documentation has it for a failure.
-# Seen: both are true; only has_error, which callers ask after a false, tells that bytes were lost. The picture is cut short.
-# Met while a completed capture was written to a disk that was nearly full. Way round: encode into memory, write the bytes oneself.
+# Seen: both are true; only has_error, which callers ask after a false, tells that bytes were lost. The picture is cut
+#   short.
+# Met while a completed capture was written to a disk that was nearly full. Way round: encode into memory, write the
+#   bytes oneself.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

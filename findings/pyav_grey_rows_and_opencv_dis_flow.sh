@@ -2,8 +2,10 @@
 # PyAV 18.1.0 and OpenCV 4.10.0.84 (Python wheels), optical flow between two frames of a small film.
 # Input: two black frames of 120 x 90 pixels, made grey by PyAV; a film of a phone's preview size.
 # Expected: to_ndarray gives an array that OpenCV's functions take, for 120 pixels across as for 128.
-# Seen: rows of 120 bytes come with the decoder's padding to 128, a view that is not contiguous; DISOpticalFlow.calc refuses it
-# with an assertion (I0.isContinuous()), though other functions of OpenCV take such views. Widths that are multiples of 16 work.
+# Seen: rows of 120 bytes come with the decoder's padding to 128, a view that is not contiguous; DISOpticalFlow.calc
+#   refuses it
+# with an assertion (I0.isContinuous()), though other functions of OpenCV take such views. Widths that are multiples of
+#   16 work.
 # Met while frames of a film were chosen by how far the camera moves. Way round: numpy.ascontiguousarray.
 set -euo pipefail
 folder=$(mktemp -d)

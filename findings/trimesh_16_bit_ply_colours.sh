@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # trimesh 5.2.0, reading a PLY point cloud whose colours are unsigned 16-bit numbers (a scanner's export).
-# Input: two points in ASCII, property ushort red, green, blue; the colour is full red, half green, no blue: 65535 32768 0.
+# Input: two points in ASCII, property ushort red, green, blue; the colour is full red, half green, no blue: 65535 32768
+#   0.
 # Expected: colours of 8 bits that mean the same, 255 128 0, as trimesh gives for the same colour in uchar and in float.
 # Seen: 255 0 0: the low byte of each number is kept. Nothing is said.
-# Met while a capture's points were read to start splats from. Way round: read the stored numbers from the cloud's metadata.
+# Met while a capture's points were read to start splats from. Way round: read the stored numbers from the cloud's
+#   metadata.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

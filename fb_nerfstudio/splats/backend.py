@@ -125,7 +125,8 @@ def _gradient_mirror(source: Tensor, device: torch.device) -> Tensor:
         mirror.grad = gradient.to(device)
         absolute = getattr(source, "absgrad", None)
         if absolute is not None:
-            setattr(mirror, "absgrad", absolute.to(device))  # noqa: B010 (tensors declare no such attribute; gsplat's strategies read it)
+            # Tensors declare no such attribute; gsplat's strategies read it.
+            setattr(mirror, "absgrad", absolute.to(device))  # noqa: B010
 
     source.register_hook(follow)
     return mirror

@@ -82,13 +82,15 @@ def run_in(folder: Path, group: Group, *, bad: tuple[int, int] | None = None, **
         path.write_text(f"{state['proj_out_2.weight'].shape}")
         return {"val": 0.0}
 
-    return Run(TinyStage(bad), LOOP, folder, preset="tiny", engine=EngineConfig(**engine), group=group, on_sheet=sheet)  # type: ignore[arg-type]
+    options = EngineConfig(**engine)  # type: ignore[arg-type]
+    return Run(TinyStage(bad), LOOP, folder, preset="tiny", engine=options, group=group, on_sheet=sheet)
 
 
 def _child(folder: Path) -> None:
     """One of two processes: everything that the tests ask about, one after the other."""
     torch.set_num_threads(1)
-    sys.modules["matplotlib"] = None  # type: ignore[assignment]  # no curves: importing it takes longer than the training
+    # No curves: importing it takes longer than the training.
+    sys.modules["matplotlib"] = None  # type: ignore[assignment]
     with joined(torch.device("cpu")) as (group, _):
         for name, engine in {
             "two": {},

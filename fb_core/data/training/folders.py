@@ -6,6 +6,7 @@ import dataclasses
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -71,7 +72,8 @@ def multi_view_source(
             CaptureSource(find_captures(data.captures), CaptureConfig(image_size=pool.image_size), device=device)
         )
     if data.meshes is not None:
-        config = MeshConfig(image_size=pool.image_size, renderer=data.mesh_renderer, supersample=pool.supersample)  # type: ignore[arg-type]
+        renderer: Any = data.mesh_renderer  # MeshConfig says which there are
+        config = MeshConfig(image_size=pool.image_size, renderer=renderer, supersample=pool.supersample)
         sources.append(
             MeshPool(find_meshes(data.meshes), config, seed=seed, device=device, encode=encode, with_images=with_images)
         )
