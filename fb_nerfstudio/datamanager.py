@@ -40,6 +40,7 @@ from fb_core.completion.results.completed_views import CompletedViews, round_tit
 from fb_core.completion.rounds import Inpainter, announcement, open_cache, run_completion
 from fb_core.completion.trust import Trust, measured_trust
 from fb_core.data.capture.frames import Frame
+from fb_core.files.faults import Refused
 from fb_core.files.whole import remove_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
@@ -66,7 +67,7 @@ from fb_nerfstudio.generation.surroundings import (
     splats_of,
 )
 from fb_nerfstudio.generation.trusted_views import surroundings_of
-from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model
+from fb_nerfstudio.refusal import refuse_bad_capture, refuse_bad_model
 from fb_nerfstudio.splats.all_or_nothing import undone_on_error
 from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 

@@ -17,16 +17,8 @@ from fb_core.completion.options import CompletionConfig
 from fb_core.data.capture.camera_path import read_camera_path
 from fb_core.data.capture.captures import validate_capture
 from fb_core.data.capture.frames import Capture, Frame
-from fb_core.files.faults import CannotWrite, is_of_the_disk
+from fb_core.files.faults import CannotWrite, Refused, is_of_the_disk
 from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
-
-
-class Refused(SystemExit, ValueError):
-    """Input that a person has to mend.
-
-    It is a ValueError for programs. Uncaught it ends a command as SystemExit does: the sentence alone on stderr, exit
-    code 1, and no traceback, which nerfstudio's commands would print for any other error.
-    """
 
 
 @contextmanager

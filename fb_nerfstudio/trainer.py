@@ -16,7 +16,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from fb_core.files.faults import telling
+from fb_core.files.faults import Refused, telling
 from fb_core.files.whole import swept, unfinished_beside, whole_file
 from fb_core.machine.interruption import stop_on_signals
 from fb_nerfstudio.checks.going_on import (
@@ -29,7 +29,7 @@ from fb_nerfstudio.checks.going_on import (
 )
 from fb_nerfstudio.checks.run_folder import claim_for, take_away
 from fb_nerfstudio.generation.surroundings import refusing
-from fb_nerfstudio.refusal import Refused, refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
+from fb_nerfstudio.refusal import refuse_bad_capture, refuse_bad_model, refusing_what_cannot_be_written
 
 
 @dataclass

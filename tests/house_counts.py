@@ -73,7 +73,7 @@ def _look_into(tree: ast.AST, place: str, counts: Counts, public: bool = True) -
             known = public and not node.name.startswith("_")
             if known and ast.get_docstring(node) is None:
                 counts.without_docstring.append(f"{place}.{node.name}")
-            if node.name.endswith(("Config", "Options")) or ".commands." in f"{place}." and _is_dataclass(node):
+            if node.name.endswith(("Config", "Options")) or (".commands." in f"{place}." and _is_dataclass(node)):
                 fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
                 if fields:
                     counts.fields_of_options[f"{place}.{node.name}"] = len(fields)

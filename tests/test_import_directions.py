@@ -36,6 +36,8 @@ FLOORS = (
     "fb_nerfstudio.splats",
     "fb_nerfstudio.capture",
     "fb_nerfstudio.refusal",
+    "fb_nerfstudio.checks",
+    "fb_nerfstudio.viewer_coverage",
     "fb_nerfstudio.viewer",
     "fb_nerfstudio.generation",
     "fb_nerfstudio.trainer",

@@ -1,4 +1,4 @@
-"""What cannot be written, told in one sentence: which file, why, and what to do."""
+"""What is refused, and what cannot be written, told in one sentence: which file, why, and what to do."""
 
 from __future__ import annotations
 
@@ -17,6 +17,14 @@ _ADVICE = {
     errno.EPERM: "choose a folder where you may write, or change its permissions",
 }
 _PROBE_BYTES = 1 << 20
+
+
+class Refused(SystemExit, ValueError):
+    """Input that a person has to mend.
+
+    It is a ValueError for programs. Uncaught it ends a command as SystemExit does: the sentence alone on stderr, exit
+    code 1, and no traceback, which nerfstudio's commands would print for any other error.
+    """
 
 
 class CannotWrite(OSError):

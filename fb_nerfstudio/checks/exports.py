@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from fb_nerfstudio.refusal import Refused
+from fb_core.files.faults import Refused
 
 _CAREFUL = "_refuses_an_empty_box"
 

@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from fb_core.completion.planning.plan import PlannedRound
 from fb_core.completion.results.completed_views import round_title
 from fb_core.completion.rounds import CapturedView
+from fb_core.files.faults import Refused
 from fb_core.sampling.randomness import mixed
-from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.viewer import CompletionPanel
 
 

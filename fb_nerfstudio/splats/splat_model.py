@@ -21,6 +21,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 
 from fb_core.evaluation.metrics.lazy_lpips import LazyLpips
+from fb_core.files.faults import Refused
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.normals import normal_picture, normals_from_depth, normals_of_picture
 from fb_core.masks import resampled
@@ -28,7 +29,6 @@ from fb_core.splatting import photometric
 from fb_core.splatting.normal_losses import alignment_loss, blended_normals, gaussian_normals, total_variation
 from fb_core.splatting.spherical_harmonics import sh_colors
 from fb_nerfstudio.bridge import batch_image, flip_axes, to_pinholes
-from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.densification import CappedStrategy, append_rows
 from fb_nerfstudio.splats.gaussians import evenly_chosen, gaussians_at, random_points

@@ -7,6 +7,7 @@ be compared. Each line that it reads names files and options in JSON; each answe
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import sys
 import time
@@ -77,14 +78,13 @@ class _Training:
     def __init__(self) -> None:
         from fb_core.networks.vae import VAE
         from fb_core.training.recipe import dit_stage
-        from fb_core.training.run.loop import Run
-        from method_configs.presets import ROOMS_TINY
 
-        recipe = ROOMS_TINY
+        run_class = _first_of("fb_core.training.run.loop", "fb_core.training.loop").Run
+        recipe = _first_of("method_configs.presets", "method_configs.ablations").ROOMS_TINY
         for where, options in _PLAIN.items():
             recipe = _replaced(recipe, where.split("."), options)
         recipe = _replaced(recipe, ["engine"], {"draw_ahead": False})
-        self._run = Run(
+        self._run = run_class(
             dit_stage(recipe, VAE(recipe.image_vae), VAE(recipe.raymap_vae)),
             recipe.dit_loop,
             None,
@@ -98,6 +98,16 @@ class _Training:
         self._run.train(at_most=1)
         took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - began_cpu}
         return took | {"loss": self._run.smoothed["loss"]}
+
+
+def _first_of(*names: str) -> Any:
+    """The first of these modules that the build has: their names changed."""
+    for name in names:
+        try:
+            return importlib.import_module(name)
+        except ModuleNotFoundError:
+            continue
+    raise ValueError(f"this build has none of the modules {', '.join(names)}; compare with a later one")
 
 
 def _replaced(config: Any, where: list[str], options: dict[str, Any]) -> Any:

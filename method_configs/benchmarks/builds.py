@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fb_core.evaluation.results import Report
 
 _HERE = Path(__file__).resolve().parent
+_ROOT = _HERE.parents[1]
 _logger = logging.getLogger(__name__)
 
 
@@ -59,7 +60,7 @@ class Builds(TableFiles):
         report = Report(seed=self.seed)
         with (
             tempfile.TemporaryDirectory(prefix="fillerbuster-builds-") as folder,
-            _Build("this", _HERE.parent, self.threads) as this,
+            _Build("this", _ROOT, self.threads) as this,
             _Build("other", self.other.resolve(), self.threads) as other,
         ):
             for known, unknown in cases:

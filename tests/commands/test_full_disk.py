@@ -28,11 +28,10 @@ from fb_core.data import media
 from fb_core.data.photos.film import write_film
 from fb_core.evaluation.figures.contact_sheet import Strip, write_contact_sheet
 from fb_core.evaluation.results import Report
-from fb_core.files.faults import CannotWrite
+from fb_core.files.faults import CannotWrite, Refused
 from fb_core.files.whole import whole_file
 from fb_core.training.run.checkpoints import Checkpoints
 from fb_core.training.run.progress_log import ProgressLog
-from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.runs.training_process import TrainingProcess
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs.commands import command_line as commands

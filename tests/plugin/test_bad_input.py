@@ -21,8 +21,9 @@ from safetensors.torch import load_file, save_file
 
 from fb_core.data import media
 from fb_core.data.capture.captures import FrameToWrite, write_capture
+from fb_core.files.faults import Refused
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.refusal import Refused, _refuse_prompt
+from fb_nerfstudio.refusal import _refuse_prompt
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
 from method_configs.splats import fillerbuster, fillerbuster_masked, fillerbuster_none, nerfiller_grid
 

@@ -28,10 +28,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from fb_core.data import media
 from fb_core.data.capture.captures import validate_capture
 from fb_core.data.rooms.room_captures import rooms
+from fb_core.files.faults import Refused
 from fb_core.inpainter import Fillerbuster
 from fb_nerfstudio import datamanager as datamanager_module
 from fb_nerfstudio.datamanager import FillerbusterDataManager
-from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.runs.finished_run import load_run
 from fb_nerfstudio.runs.run_config import read_run_config
 from fb_nerfstudio.splats.splat_model import FillerbusterSplatModel

@@ -19,11 +19,11 @@ from fb_core.completion.options import CompletionConfig
 from fb_core.completion.requests import RemoveView, key_of
 from fb_core.completion.results.completed_views import BROUGHT, round_title
 from fb_core.data.capture.captures import FrameToWrite, read_capture, split_lists, write_capture, write_transforms
+from fb_core.files.faults import Refused
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio import datamanager
 from fb_nerfstudio.capture.dataparser import without_open3d
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig
-from fb_nerfstudio.refusal import Refused
 from method_configs.commands import command_line as commands
 
 PHOTOS, GENERATED = 9, 2

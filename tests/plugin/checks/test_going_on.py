@@ -25,10 +25,10 @@ from helpers.tiny_models import save_tiny_model
 from nerfstudio.scripts import train as ns_train
 
 from fb_core.data import media
+from fb_core.files.faults import Refused
 from fb_nerfstudio.checks import run_folder
 from fb_nerfstudio.checks.going_on import CaptureIdentity, parsed
 from fb_nerfstudio.datamanager import FillerbusterDataManager
-from fb_nerfstudio.refusal import Refused
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
 
 STEP = 7

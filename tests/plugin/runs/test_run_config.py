@@ -192,7 +192,7 @@ class Touch:
 
 
 def test_code_in_a_checkpoint_is_not_executed(tmp_path: Path, tiny_capture: Path, capsys):
-    from fb_nerfstudio.refusal import Refused
+    from fb_core.files.faults import Refused
     from fb_nerfstudio.trainer import FillerbusterTrainer
 
     run = make_run(tmp_path / "run", tiny_capture, generated_views())
