@@ -306,7 +306,9 @@ def autoencoder_dtype(dtype: torch.dtype) -> torch.dtype:
 
 
 def model_hash(folder: str | os.PathLike[str]) -> str:
-    """Sixteen hexadecimal digits that stand for a model's architecture and stored weights; its info does not count."""
+    """Sixteen hexadecimal digits that stand for a model's architecture and stored weights; its info does not count.
+    Raises ValueError for a folder that lacks a file.
+    """
     folder = Path(folder)
     config, _ = read_config(folder)
     digest = hashlib.sha256(json.dumps(dataclasses.asdict(config), sort_keys=True).encode())

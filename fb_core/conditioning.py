@@ -26,7 +26,6 @@ FACTOR = 8
 """Pixels per latent along each side."""
 STATE_CHANNELS = 2 * LATENT_CHANNELS
 CONDITIONING_CHANNELS = 2 * LATENT_CHANNELS + 2
-SEQUENCE_CHANNELS = STATE_CHANNELS + CONDITIONING_CHANNELS
 _VIEWS_AT_ONCE = 16  # so that memory does not grow with the number of views
 _ROUNDING = 1e-4  # of the mean of a mask over a latent's pixels
 

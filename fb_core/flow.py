@@ -27,13 +27,6 @@ def velocity(data: Float[Tensor, "*any"], noise: Float[Tensor, "*any"]) -> Float
     return noise - data
 
 
-def data_from(
-    state: Float[Tensor, "b *rest"], predicted: Float[Tensor, "b *rest"], time: Float[Tensor, "b"]
-) -> Float[Tensor, "b *rest"]:
-    """The data that a velocity prediction at time t points to: z = z_t - t v."""
-    return state - time.reshape(-1, *[1] * (state.ndim - 1)) * predicted
-
-
 def logit_normal_times(count: int, *, generator: torch.Generator) -> Float[Tensor, "b"]:
     """Training times in (0, 1): the sigmoid of a standard normal, as in Esser et al. 2024."""
     return torch.sigmoid(torch.randn(count, generator=generator, device=generator.device, dtype=torch.float32))

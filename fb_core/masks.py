@@ -21,18 +21,6 @@ to 1 at most.
 """
 
 
-def rotated_rectangle(
-    height: int, width: int, *, center: tuple[float, float], size: tuple[float, float], angle_radians: float
-) -> Tensor:
-    """1 inside a rotated rectangle, 0 outside, tested at the pixel centres; center (y, x) and size (h, w) in pixels.
-    Shape [h, w].
-    """
-    y, x = torch.meshgrid(torch.arange(height) + 0.5 - center[0], torch.arange(width) + 0.5 - center[1], indexing="ij")
-    along = x * math.cos(angle_radians) + y * math.sin(angle_radians)
-    across = -x * math.sin(angle_radians) + y * math.cos(angle_radians)
-    return ((along.abs() <= size[1] / 2) & (across.abs() <= size[0] / 2)).float()
-
-
 def partly_known(
     height: int, width: int, *, generator: torch.Generator, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "1 h w"]:
@@ -69,6 +57,8 @@ def training_mixture(
 
     ``known`` and ``unknown`` override the two counts (the released code's split is n//4 and n//2). ``in_order`` keeps
     known views first, then unknown ones, then the rest, as in the paper's evaluation.
+
+    Raises ValueError for more known and unknown views than there are.
     """
     known = count // 4 if known is None else known
     unknown = count // 2 if unknown is None else unknown
@@ -102,6 +92,8 @@ def grow_hole(known: Float[Tensor, "n 1 h w"], *, pixels: int) -> Float[Tensor, 
 def to_latent_grid(known: Float[Tensor, "n 1 h w"], *, factor: int = 8) -> Float[Tensor, "n 1 lh lw"]:
     """The operation D of the paper's Eq. 1: area averages, so borders of a mask become fractional. Sides are multiples
     of ``factor``.
+
+    Raises ValueError for other sides.
     """
     height, width = known.shape[-2:]
     if height % factor or width % factor or not height or not width:

@@ -86,6 +86,8 @@ def to_nerfstudio(pinholes: Pinholes, device: torch.device | str | None = None) 
 def batch_image(batch: dict, device: torch.device | str | None = None) -> Float[Tensor, "3 h w"]:
     """RGB in [0, 1] of ``batch["image"]`` ([h, w, 3 or 4], uint8 or float). An alpha channel is dropped, see
     :func:`batch_known`.
+
+    Raises ValueError for other shapes.
     """
     image = _unit_range(batch["image"], "image")
     if image.ndim != 3 or image.shape[-1] not in (3, 4):
@@ -96,6 +98,8 @@ def batch_image(batch: dict, device: torch.device | str | None = None) -> Float[
 def batch_known(batch: dict, device: torch.device | str | None = None) -> Float[Tensor, "1 h w"]:
     """The known-mask (1 = known) of a batch: its ``mask`` ([h, w, 1]) times the image's alpha; all ones without
     either.
+
+    Raises ValueError for a mask of another size than the image.
     """
     image = batch["image"]
     known = (

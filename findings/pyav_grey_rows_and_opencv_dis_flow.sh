@@ -11,7 +11,8 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet --disable-pip-version-check av==18.1.0 opencv-python-headless==4.10.0.84 numpy==1.26.4
+"$folder/venv/bin/pip" install --quiet --disable-pip-version-check \
+    av==18.1.0 opencv-python-headless==4.10.0.84 numpy==1.26.4
 cd "$folder"
 venv/bin/python - <<'PYTHON' | tee seen
 import av
@@ -23,7 +24,8 @@ flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
 for width in (128, 120):
     frame = av.VideoFrame.from_ndarray(np.zeros((90, width, 3), dtype=np.uint8), format="rgb24")
     grey = frame.reformat(format="gray8").to_ndarray()
-    print(width, "contiguous", grey.flags["C_CONTIGUOUS"], "row bytes", grey.strides[0], "blurred", cv2.blur(grey, (3, 3)).shape)
+    blurred = cv2.blur(grey, (3, 3)).shape
+    print(width, "contiguous", grey.flags["C_CONTIGUOUS"], "row bytes", grey.strides[0], "blurred", blurred)
     try:
         print(width, "flow", flow.calc(grey, grey, None).shape)
     except cv2.error as error:

@@ -121,6 +121,8 @@ def plan_passes(views: int, *, room: int) -> Passes:
     Args:
         views: along the path.
         room: new views that fit into a sequence beside the photos, at least 1.
+
+    Raises ValueError where there is no room for a new view.
     """
     if room < 1:
         raise ValueError(f"room: expected at least one new view beside the photos, got {room}")

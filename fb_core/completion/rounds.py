@@ -48,10 +48,14 @@ class Inpainter(Protocol):
     model_hash: str
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Width and height of the views that the model was trained on, in pixels."""
+        ...
 
     @property
-    def recommended_sampling(self) -> SamplingConfig: ...
+    def recommended_sampling(self) -> SamplingConfig:
+        """The options that the model's folder recommends."""
+        ...
 
     def complete(
         self,
@@ -62,7 +66,9 @@ class Inpainter(Protocol):
         on_step: Callable[[int, int], None] | None,
         prompt: str | None = None,
         current: Views | None = None,
-    ) -> Views: ...
+    ) -> Views:
+        """The views with what was unknown generated; ``current`` is what generation starts from. Known pixels stay."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -64,6 +64,8 @@ def read_image_with_alpha(
     """Like :func:`read_image`, with the alpha channel (1 = opaque) or None where the file has none.
 
     The colours are not multiplied by alpha (except in EXR files, whose definition wants it so).
+
+    Raises ValueError for channels that are neither RGB nor grey.
     """
     path = _checked_file(path)
     with told(path):
@@ -161,6 +163,8 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
     """Writes colours (3 channels) or grey (1 channel); the suffix chooses the format.
 
     Values are clipped to [0, 1] and rounded to ``bits`` (8 or 16; JPEG knows 8 only). EXR keeps float32 as given.
+
+    Raises ValueError for other shapes and bits, and for NaN and infinity.
     """
     path = Path(path)
     if image.shape[0] not in (1, 3) or image.shape[1] == 0 or image.shape[2] == 0:
@@ -189,7 +193,9 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
 
 
 def write_exr(path: str | Path, channels: Mapping[str, Float[Tensor, "h w"]]) -> None:
-    """Writes named float32 channels of one size, losslessly compressed (for raymaps, depth, normals)."""
+    """Writes named float32 channels of one size, losslessly compressed (for raymaps, depth, normals). Raises ValueError
+    for channels of different sizes, and for none.
+    """
     sizes = {tuple(channel.shape) for channel in channels.values()}
     if len(sizes) != 1:
         raise ValueError(
@@ -200,7 +206,9 @@ def write_exr(path: str | Path, channels: Mapping[str, Float[Tensor, "h w"]]) ->
 
 
 def read_exr(path: str | Path, names: list[str] | None = None) -> dict[str, Float[Tensor, "h w"]]:
-    """The named float channels of an EXR file (all of them by default). The order inside the file does not matter."""
+    """The named float channels of an EXR file (all of them by default). The order inside the file does not matter.
+    Raises ValueError for channels that the file does not have.
+    """
     path = _checked_file(path)
     with told(path):
         pixels, stored, _ = decode(path)
@@ -227,6 +235,8 @@ def resize(image: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tens
 
     Constants stay constant and no value leaves the input's range. The camera that belongs to the result is
     ``camera.scaled(width, height)``.
+
+    Raises ValueError for sides below 1 pixel.
     """
     if height < 1 or width < 1:
         raise ValueError(f"resize: expected a height and a width of at least 1 pixel, got {height} and {width}")
@@ -240,6 +250,8 @@ def shrink(image: Float[Tensor, "c h w"], longest_side: int | None) -> Float[Ten
     the area it covers.
 
     An image that is small enough already, or None, comes back as it is. No side becomes shorter than one pixel.
+
+    Raises ValueError for a side below 1 pixel.
     """
     if longest_side is None or max(image.shape[1:]) <= longest_side:
         return image

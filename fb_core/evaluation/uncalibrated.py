@@ -116,6 +116,8 @@ def evaluate_capture(
 ) -> list[dict[str, Any]]:
     """Rows of errors of photos whose cameras are known, once these are hidden: by the model and by features, focal
     lengths told or not.
+
+    Raises ValueError for fewer than two photos with cameras.
     """
     truth = [photo.camera for photo in photos if photo.camera is not None]
     if len(truth) != len(photos) or len(photos) < 2:

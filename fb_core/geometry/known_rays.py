@@ -21,6 +21,8 @@ def frame_of_known_rays(raymaps: Float[Tensor, "n 6 h w"], known: Float[Tensor, 
     It is upright in the first view whose known rays tell a camera's axes. Where none does (a row of pixels, single
     rays), it follows the rays that there are, so that it still moves and turns with the world. Raymaps in the world,
     unknown rays may hold anything.
+
+    Raises ValueError for a known ray that is not finite.
     """
     there = (known[:, 0] > 0).cpu()
     posed = there.flatten(1).any(dim=1).nonzero()[:, 0].tolist()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
@@ -65,19 +64,7 @@ def normals_of_picture(picture: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*ba
     return (picture - 0.5) * picture.new_tensor([2.0, -2.0, -2.0])
 
 
-def normals_to_world(normals: Float[Tensor, "n h w 3"], cameras: Pinholes) -> Float[Tensor, "n h w 3"]:
-    """Camera-frame normals turned into world coordinates."""
-    return torch.einsum("nij,nhwj->nhwi", cameras.rotations, normals)
-
-
 def facing(normals: Float[Tensor, "*batch 3"], towards: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Normals flipped where they point away from the direction ``towards`` (any length; taken as constant)."""
     cosine = (normals.detach() * towards.detach()).sum(dim=-1, keepdim=True)
     return torch.where(cosine < 0, -normals, normals)
-
-
-def interior(height: int, width: int, *, device: torch.device | str | None = None) -> Float[Tensor, "1 h w"]:
-    """1 where :func:`normals_from_depth` can know the normal, 0 on the one-pixel border."""
-    inside = torch.zeros(height, width, device=device)
-    inside[1:-1, 1:-1] = 1.0
-    return rearrange(inside, "h w -> 1 h w")

@@ -134,6 +134,8 @@ class CanonicalFrame:
     ) -> CanonicalFrame:
         """The frame that is upright in a camera-to-world rotation and holds all centres. In float64 on the CPU (a few
         numbers).
+
+        Raises ValueError for centres that are not finite.
         """
         axes = _nearest_rotation(rotation_camera.detach().cpu().double())
         centers = all_centers.detach().cpu().double()

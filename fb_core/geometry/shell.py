@@ -62,7 +62,7 @@ class Shell:
 
 
 def sphere(center: Float[Tensor, "3"], radius: float) -> Shell:
-    """The shell of constant radius (scene units, positive)."""
+    """The shell of constant radius (scene units, positive). Raises ValueError for other radii."""
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(
             f"shell: radius must be a positive finite number, got {radius}; check the scale of the capture"
@@ -92,6 +92,8 @@ def fit_shell(
         up: unit direction; when given, a flat floor or ceiling among the points goes on where none was seen.
         bandwidth_degrees: angular smoothing.
         fewest_points: with fewer usable points the result is a sphere at their median distance.
+
+    Raises ValueError for a bandwidth that is not positive and finite.
     """
     if not 0 < bandwidth_degrees < math.inf:
         raise ValueError(f"shell: bandwidth_degrees must be a positive finite number, got {bandwidth_degrees}")
@@ -136,6 +138,8 @@ def intersect(
         origins: ray origins in world coordinates.
         directions: unit ray directions.
         samples: marching steps per ray; features thinner than (shell size / samples) may be jumped over.
+
+    Raises ValueError for fewer than one step.
     """
     if samples < 1:
         raise ValueError(f"shell: expected at least one marching step per ray, got {samples}")

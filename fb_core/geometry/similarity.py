@@ -36,6 +36,8 @@ class Similarity:
 
         Exact for exact cameras, least squares otherwise. Cameras that all stand in one place tell no scale; then it is
         the one given.
+
+        Raises ValueError without cameras and for poses that are not finite.
         """
         (rotations, centers), (their_rotations, their_centers) = first, second
         if not len(centers) or not all(bool(torch.isfinite(one).all()) for pair in (first, second) for one in pair):

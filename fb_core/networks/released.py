@@ -65,7 +65,9 @@ def read_released(folder: str | os.PathLike[str]) -> Released:
 
 
 def read_state(path: Path, key: str) -> dict[str, Tensor]:
-    """The tensors under `key` of a pickled dictionary, mapped into memory, their names free of wrappers' prefixes."""
+    """The tensors under `key` of a pickled dictionary, mapped into memory, their names free of wrappers' prefixes.
+    Raises ValueError for files that are damaged, of another architecture, or hold more than tensors.
+    """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:

@@ -296,6 +296,8 @@ class VAE(nn.Module):
         """Pictures of scaled latents, in [0, 1], or unclamped for training's losses.
 
         `decoder` stands in for the whole decoder: a `TiledDecoder` of it, for large pictures.
+
+        Raises ValueError for another number of channels.
         """
         if latents.shape[1] != self.config.latent_channels:
             raise ValueError(f"latents: expected {self.config.latent_channels} channels, got {latents.shape[1]}.")

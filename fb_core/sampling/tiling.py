@@ -40,6 +40,8 @@ def tiled(predict: Predict, *, window: int | None, rounds: int = 1, orders: Orde
         window: views per window; None or anything >= n means one window in the given order, without shuffling.
         rounds: how many partitions are averaged in every evaluation (the paper uses 8 for poses).
         orders: the order of the views that every round cuts; `random_orders(seed)` for the paper's random partitions.
+
+    Raises ValueError for windows and rounds below 1.
     """
     if window is not None and window < 1:
         raise ValueError(f"window: expected at least 1 view, got {window}")

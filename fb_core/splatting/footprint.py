@@ -36,6 +36,7 @@ class Lens:
 
     @classmethod
     def of(cls, K: Float[Tensor, "3 3"], width: int, height: int) -> Lens:
+        """The numbers of an intrinsic matrix (pixels) and of a picture of that size."""
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
         return cls(
@@ -109,6 +110,7 @@ class Footprint:
 
 
 def unit_quaternions(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions [n, 4] (wxyz) as unit columns [4, n], and one over their lengths [n]; the identity where all is 0."""
     columns = quats.t().contiguous()
     length = columns.square().sum(dim=0).sqrt_()
     if bool((length > 0).all()):
@@ -150,6 +152,7 @@ def through(rows: Float[Tensor, "2 3 n"], matrix: Float[Tensor, "3 3 n"]) -> Flo
 
 
 def cross(p: Float[Tensor, "3 n"], q: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
+    """The cross products of columns."""
     out = torch.empty_like(p)
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         torch.mul(p[i], q[j], out=out[k]).addcmul_(p[j], q[i], value=-1.0)

@@ -123,6 +123,8 @@ def make_stage(
 ) -> tuple[VAEStage | DiTStage, LoopConfig]:
     """A stage with fresh weights and how it is optimised. Without a folder the transformer learns from autoencoders as
     they are born.
+
+    Raises ValueError for unknown stages.
     """
     if stage not in STAGES:
         raise ValueError(f"stage: expected one of {list(STAGES)}, got {stage!r}")

@@ -23,11 +23,13 @@ from fb_nerfstudio.viewer import CompletionPanel
 
 
 def say_found(planned: PlannedRound) -> None:
+    """One line for a round that the cache had."""
     title = round_title(planned.role, planned.number)
     CONSOLE.print(f"{title}: {len(planned.cameras)} views found in the cache, nothing is generated for them.")
 
 
 def release_memory() -> None:
+    """Memory of the model that has just been dropped goes back to the machine and to the GPU."""
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()

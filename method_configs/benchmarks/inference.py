@@ -45,7 +45,7 @@ class Inference(TableFiles):
     """Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one."""
 
     def run(self) -> None:
-        """Measure what was not measured before, and report."""
+        """Measure what was not measured before, and report. Raises ValueError for options that no measurement has."""
         from rich.progress import track
 
         from fb_core.evaluation.results import Report

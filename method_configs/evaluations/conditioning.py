@@ -40,7 +40,7 @@ class Conditioning(TableFiles):
     """Draw the first sequence into this PNG."""
 
     def run(self) -> None:
-        """Generate what was not generated before, and report."""
+        """Generate what was not generated before, and report. Raises ValueError for options below 1."""
         import dataclasses
 
         from rich.progress import track

@@ -44,7 +44,7 @@ class Masked(TableFiles):
     """torchvision's weights of SqueezeNet 1.1; without them LPIPS is left out."""
 
     def run(self) -> None:
-        """Render and report."""
+        """Render and report. Raises ValueError for options that name nothing to judge."""
         if not self.runs:
             raise ValueError("masked: expected one or more folders of runs, got none; name a folder with config.yml")
         publish(self, [masked_row(run, self) for run in self.runs], self.seed)
@@ -78,7 +78,7 @@ class Paper(TableFiles):
     """torchvision's weights of SqueezeNet 1.1; without them LPIPS is left out."""
 
     def run(self) -> None:
-        """Train what is missing, judge, report."""
+        """Train what is missing, judge, report. Raises ValueError for options that name nothing to judge."""
         unknown = sorted(set(self.methods) - set(METHODS))
         if unknown or not self.methods:
             raise ValueError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")

@@ -62,7 +62,9 @@ class ModelOnCaptures(TableFiles):
     """Which rooms, where there is no data."""
 
     def run(self) -> None:
-        """Complete what was not completed before, and report."""
+        """Complete what was not completed before, and report. Raises ValueError for lengths below 4, counts below 1,
+        and folders of one name.
+        """
         from rich.progress import track
 
         from fb_core.evaluation.results import Report

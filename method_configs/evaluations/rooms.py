@@ -47,7 +47,9 @@ class Rooms:
     """Draw the first rooms into this PNG."""
 
     def run(self) -> None:
-        """Complete the same unseen rooms at every guidance scale and report."""
+        """Complete the same unseen rooms at every guidance scale and report. Raises ValueError for strengths beyond 0
+        to 1, and for no samples.
+        """
         import dataclasses
 
         from rich.progress import track

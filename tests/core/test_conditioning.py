@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from fb_core.conditioning import (
-    SEQUENCE_CHANNELS,
     Conditioning,
     assemble,
     encode_known,
@@ -97,7 +96,7 @@ def test_channels_are_in_the_order_of_the_released_weights():
     sequence = join(
         unsplit(fill(16, 0.0), fill(16, 1.0)), assemble(fill(16, 2.0), fill(16, 3.0), fill(1, 4.0), fill(1, 5.0))
     )
-    assert sequence.shape == (1, 2, SEQUENCE_CHANNELS, 4, 4)
+    assert sequence.shape == (1, 2, 66, 4, 4)
     assert sequence[0, 0, :, 0, 0].tolist() == [0.0] * 16 + [1.0] * 16 + [2.0] * 16 + [3.0] * 16 + [4.0, 5.0]
 
 

@@ -48,7 +48,9 @@ class PictureInpainter(Protocol):
         seed: int,
         sampling: SamplingConfig,
         prompt: str,
-    ) -> Float[Tensor, "3 h w"]: ...
+    ) -> Float[Tensor, "3 h w"]:
+        """The picture in [0, 1] with its unknown pixels (``known`` is 0 there) filled in."""
+        ...
 
 
 class GridInpainter:

@@ -140,6 +140,8 @@ def write_transforms(capture: Capture, folder: str | Path, *, overwrite: bool = 
     Reading the result gives bit-equal poses, intrinsics and extras. Names of files among the extras (per-frame keys
     that end in ``_path``, and the lists of train, val and test files) are re-expressed for the new folder. Returns the
     path of the JSON file.
+
+    Raises ValueError where the file exists and ``overwrite`` is not set.
     """
     folder = Path(folder)
     target = folder / JSON_NAME

@@ -33,7 +33,7 @@ _ROTATION_TOLERANCE = 1e-3  # an error of that size moves a pixel by one at a fo
 
 
 def load_transforms(path: Path) -> dict[str, Any]:
-    """The JSON object in a file."""
+    """The JSON object in a file. Raises ValueError for a file that is empty, no JSON, or no object with frames."""
     if path.stat().st_size <= _BLANK and not path.read_bytes().strip():
         raise ValueError(f"capture {path}: the file is empty; process the pictures again")
     try:
@@ -63,6 +63,8 @@ def camera_from(where: str, image_path: Path, entry: dict[str, Any], shared: dic
         image_path: asked for its size where the file does not tell w and h.
         entry: the frame's object.
         shared: the whole file's object; its intrinsics win over the frame's, as in nerfstudio.
+
+    Raises ValueError for missing intrinsics and for ones that no camera has.
     """
     values = {**entry, **shared}
     if "w" in values and "h" in values:
@@ -140,7 +142,9 @@ def model_of(entry: dict[str, Any], shared: dict[str, Any]) -> str:
 
 
 def to_json(meta: dict[str, Any], where: str) -> str:
-    """The text of a JSON file; doubles keep every bit."""
+    """The text of a JSON file; doubles keep every bit. Raises ValueError for extras that are no plain finite JSON
+    values.
+    """
     try:
         return json.dumps(meta, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -161,7 +165,7 @@ def _focal(where: str, values: dict[str, Any], name: str, angle_name: str, lengt
 
 
 def finite_number(where: str, values: dict[str, Any], key: str) -> float:
-    """``values[key]`` as a float."""
+    """``values[key]`` as a float. Raises ValueError for anything else."""
     value = values[key]
     if not is_finite(value):
         raise ValueError(f"{where}: expected a finite number for {key}, got {value!r}; correct the file")
@@ -169,7 +173,9 @@ def finite_number(where: str, values: dict[str, Any], key: str) -> float:
 
 
 def checked_pose(where: str, matrix: Any) -> Float[Tensor, "3 4"]:
-    """The OpenGL camera-to-world matrix as it stands in the file, once it is known to be a rigid motion."""
+    """The OpenGL camera-to-world matrix as it stands in the file, once it is known to be a rigid motion. Raises
+    ValueError for anything else, NaN and mirrors included.
+    """
     try:
         pose = torch.tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):

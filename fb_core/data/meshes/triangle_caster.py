@@ -32,7 +32,9 @@ class TriangleHits:
 
 
 def cast_triangles(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Pinholes) -> TriangleHits:
-    """First triangles, both sides of which are seen, on the rays through one camera's pixel centres."""
+    """First triangles, both sides of which are seen, on the rays through one camera's pixel centres. Raises ValueError
+    unless there is one camera.
+    """
     if len(camera) != 1:
         raise ValueError(f"cast_triangles: expected one camera, got {len(camera)}; cast them one by one")
     pose = camera.world_to_camera[0].double()

@@ -116,7 +116,7 @@ class ShardStream:
 
 
 def samples_of(shard: str) -> Iterator[dict[str, Any]]:
-    """The samples of one shard, in order."""
+    """The samples of one shard, in order. Raises ValueError where webdataset is not installed."""
     try:
         from webdataset.compat import WebDataset  # not named in the package's own __init__ for type checkers
     except ImportError as error:

@@ -148,6 +148,8 @@ def accuracy(results: Sequence[PairResult]) -> dict[str, float]:
         over thresholds 1, 2, ... 10; ``median_degrees``; ``failed``: pairs without an estimate; ``pairs``; ``matches``:
         their median;
         ``still_5``: what a film whose pictures never turn would score at 5 degrees.
+
+    Raises ValueError without pairs.
     """
     if not results:
         raise ValueError("relative rotation accuracy: expected at least one pair, got none")

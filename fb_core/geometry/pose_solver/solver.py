@@ -170,7 +170,9 @@ def recover_cameras_from_rays(
     principal: Float[Tensor, "n 2"] | None = None,
     solving: PoseSolving = PoseSolving(),
 ) -> RecoveredCameras:
-    """The same from lists of rays through any points (x, y) of images of one size, all of which are fitted."""
+    """The same from lists of rays through any points (x, y) of images of one size, all of which are fitted. Raises
+    ValueError for lists of different lengths and for pixels that are not finite.
+    """
     if weights is None:
         weights = torch.ones_like(origins[..., 0])
     shapes = {tuple(tensor.shape[:2]) for tensor in (origins, directions, pixels, weights)}

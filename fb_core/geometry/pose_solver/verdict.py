@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -115,11 +114,6 @@ def arrangement_of(centers: Float[Tensor, "n 3"], deviation: Float[Tensor, " n"]
     apart = (centers - centers.mean(dim=0)).norm(dim=1)
     rounding = 4 * precision * centers.norm(dim=1).max()
     return Arrangement.ONE_PLACE if bool((apart <= 5 * deviation + rounding).all()) else Arrangement.APART
-
-
-def verdicts_of(judgements: Sequence[Judgement]) -> tuple[Verdict, ...]:
-    """Verdicts alone."""
-    return tuple(judgement.verdict for judgement in judgements)
 
 
 def _narrow_side(rays: Rays) -> Float[Tensor, " n"]:

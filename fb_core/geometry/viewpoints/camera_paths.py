@@ -56,6 +56,8 @@ class Ellipse:
         cameras (a short arc), or there are fewer, the ellipse has the centres' own mean and moments, which is exact for
         centres all around. Centres on a line get a narrow ellipse along it, level across; centres in one place get that
         place.
+
+        Raises ValueError without centres and for centres that are not finite.
         """
         places = centers.double()
         if not len(places) or not bool(torch.isfinite(places).all()):

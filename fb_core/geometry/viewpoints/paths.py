@@ -111,6 +111,8 @@ def cylinder_centers(
             views.
         half_height: heights lie between minus and plus this about the centre.
         levels: number of equally spaced heights; one level is at the centre's height.
+
+    Raises ValueError for a negative count.
     """
     if count < 0:
         raise ValueError(f"cylinder_centers: expected a count of 0 or more, got {count}")
@@ -145,6 +147,8 @@ def kept_clear(
 
     A blocked centre moves straight towards the nearest captured camera (a ``refuge``: somebody stood there) in eighths
     of the way, and stops at the first clear place; the last resort is the captured place itself.
+
+    Raises ValueError without a captured place.
     """
     if len(centers) == 0:
         return centers
@@ -194,7 +198,9 @@ def seen_by(
 
 
 def sphere_directions(count: int, *, like: Tensor) -> Float[Tensor, "n 3"]:
-    """Unit directions that are nearly equally spaced (a Fibonacci lattice about z)."""
+    """Unit directions that are nearly equally spaced (a Fibonacci lattice about z). Raises ValueError for a negative
+    count.
+    """
     if count < 0:
         raise ValueError(f"sphere_directions: expected a count of 0 or more, got {count}")
     index = torch.arange(count, device=like.device, dtype=like.dtype) + 0.5
@@ -228,6 +234,8 @@ def outward_directions(
         half_angle_radians: half the opening of a view's cone.
         max_pitch_degrees: steepest look direction.
         generator: on the CPU.
+
+    Raises ValueError for a pitch beyond 0 to 90 degrees.
     """
     if not 0 <= max_pitch_degrees <= 90:
         raise ValueError(f"outward_directions: expected max_pitch_degrees from 0 to 90, got {max_pitch_degrees}")
@@ -295,6 +303,8 @@ def spread_subset(cameras: list[Pinholes], count: int) -> list[int]:
 def strided_subset(total: int, count: int) -> list[int]:
     """``count`` equally spaced indices from first to last without repetition, all when there are fewer (the paper's
     choice).
+
+    Raises ValueError for a negative count.
     """
     if count < 0:
         raise ValueError(f"strided_subset: expected a count of 0 or more, got {count}")

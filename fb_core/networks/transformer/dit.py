@@ -242,6 +242,8 @@ class DiT(nn.Module):
 
         The projection is linear in the channels: the tokens of a sequence are the sum over any split of its channels,
         each part projected from its `first_channel` on and one of them with the bias.
+
+        Raises ValueError without views and for sides that are no multiples of the patch.
         """
         patch, proj = self.config.patch, self.pos_embed.proj
         _, views, channels, height, width = sequence.shape
@@ -267,6 +269,8 @@ class DiT(nn.Module):
     ) -> Float[Tensor, "b tokens d"]:
         """What is added to the tokens of `views` latents of a size: place in the view, and which view. float32; b is 1
         without `index`.
+
+        Raises ValueError for another number of index positions than of views.
         """
         config = self.config
         layout = layout_embedding(height // config.patch, width // config.patch, config.width, device=device)
@@ -293,7 +297,9 @@ class DiT(nn.Module):
         return Modulation(torch.stack(blocks), torch.stack([scale, shift]))
 
     def text_context(self, text: Float[Tensor, "b words t"] | None) -> list[KeysValues | None]:
-        """Keys and values of every block's cross-attention; Nones for a network without text."""
+        """Keys and values of every block's cross-attention; Nones for a network without text. Raises ValueError for
+        text of another width, and for any in a network without text.
+        """
         expected = self.config.text_width
         if not expected:
             if text is not None:

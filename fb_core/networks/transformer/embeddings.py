@@ -33,6 +33,8 @@ def sincos(positions: Float[Tensor, "*batch"], width: int) -> Float[Tensor, "*ba
     """Embed scalar positions: `width/2` sines followed by `width/2` cosines of `10 * position * frequency`.
 
     Frequencies fall geometrically from 1 to 1/10000, both included. `width` is even and at least 4.
+
+    Raises ValueError for other widths than even ones from 4 on.
     """
     if width < 4 or width % 2:
         raise ValueError(f"width: expected an even number of at least 4 embedding channels, got {width}.")
@@ -76,6 +78,8 @@ def index_positions(
     Without a generator (inference) views are spaced evenly from 0 to 2 pi inclusive; one view lies at 0. With a
     generator (training) "flexible" draws every view's position uniformly, which lets one model take any number of
     views; "fixed" keeps the even spacing and "none" gives zeros. Draws happen on the generator's device.
+
+    Raises ValueError for unknown modes.
     """
     if mode not in INDEX_MODES:
         raise ValueError(f"mode: expected one of {', '.join(INDEX_MODES)}, got {mode!r}.")

@@ -101,6 +101,7 @@ class Scratch:
         self._layers: dict[tuple[str | int, ...], tuple[Tensor, ...]] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
+        """A tensor of that name and shape, whose memory is used again and again; its content is whatever was left there."""
         view = self._views.get((name, *shape))
         if view is None:
             size = math.prod(shape)
@@ -137,6 +138,7 @@ def _monomials(grid: CellGrid, like: Tensor) -> Float[Tensor, "6 p"]:
 
 
 def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> Table:
+    """What blocks read of every Gaussian, a row each: logarithm of the opacity, place, shape, values, and 1."""
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
     used = GEOMETRY + values.shape[1] + 1
     rows = values.new_empty(values.shape[0], padded(used))

@@ -36,14 +36,17 @@ class CellGrid:
 
     @property
     def columns(self) -> int:
+        """Cells in a row of a picture."""
         return -(-self.width // self.cell_width)
 
     @property
     def rows(self) -> int:
+        """Rows of cells in a picture."""
         return -(-self.height // self.cell_height)
 
     @property
     def count(self) -> int:
+        """Cells of all cameras."""
         return self.cameras * self.rows * self.columns
 
     def centers(self, like: Tensor) -> tuple[Float[Tensor, " cells"], Float[Tensor, " cells"]]:

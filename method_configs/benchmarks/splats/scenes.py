@@ -58,6 +58,8 @@ def room_scene(count: int, size: int, *, seed: int = 0) -> SplatScene:
 
     On the screen they are as large at 3 m whatever the size of the picture (2.6 pixels, log-normal), opacities are
     sigmoid(1.5 N): the statistics of the scenes for which the bars were set. About two thirds lie in the picture.
+
+    Raises ValueError for no Gaussians and for pictures below 8 pixels.
     """
     if count < 1 or size < 8:
         raise ValueError(f"count and size: expected at least 1 Gaussian and 8 pixels, got {count} and {size}")

@@ -134,6 +134,7 @@ class Job:
 
     @property
     def all_known(self) -> bool:
+        """Whether every photo has a camera already."""
         return all(photo.camera is not None for photo in self.photos)
 
 

@@ -133,7 +133,9 @@ class Designs:
     """Write all measurements to this file."""
 
     def run(self) -> None:
-        """Train what is missing, measure what is missing, report."""
+        """Train what is missing, measure what is missing, report. Raises ValueError for unknown designs, and for no
+        seeds or batches.
+        """
         from fb_core.evaluation.results import Report
         from fb_core.inpainter import Fillerbuster
         from method_configs.benchmarks.command import show

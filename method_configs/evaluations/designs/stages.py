@@ -33,7 +33,7 @@ class KeptStage(DiTStage):
         self.batches = batches
 
     def encoded(self, step: int, rows: range) -> Encoded:
-        """The whole batch; a part of it is not kept."""
+        """The whole batch; a part of it is not kept. Raises ValueError for a part of the batch."""
         if rows != range(self.batches.stage.batch):
             raise ValueError(f"kept batches: expected all rows at once, {range(self.batches.stage.batch)}, got {rows}")
         return self.batches.get(step).encoded

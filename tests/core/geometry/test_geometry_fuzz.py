@@ -210,10 +210,9 @@ def surfaces(dice: Dice) -> Any:
     depth = dice.mask(len(cameras), cameras.height, cameras.width).to(cameras.focal) * dice.of(1.0, 1e-6, 1e6, -1.0)
     depth = torch.where(depth > 0.5, depth, dice.of(math.nan, 0.0, math.inf))
     found = normals.normals_from_depth(depth, cameras)
-    world = normals.normals_to_world(found, cameras)
+    world = torch.einsum("nij,nhwj->nhwi", cameras.rotations, found)
     picture = normals.normal_picture(found)
-    inner = normals.interior(dice.number(1, 4), dice.number(1, 4))
-    return found, world, normals.normals_of_picture(picture), normals.facing(world, world), inner
+    return found, world, normals.normals_of_picture(picture), normals.facing(world, world)
 
 
 def features(dice: Dice) -> Any:
