@@ -44,6 +44,8 @@ def told(path: Path) -> Iterator[None]:
 def colour_channels(names: list[str], path: Path) -> tuple[list[int], int | None]:
     """(places of R, G, B, or that of grey; place of alpha) among a file's channels; of several layers, those of
     Blender's Combined.
+
+    Raises ValueError for channels that are neither RGB nor grey.
     """
     place = {name: index for index, name in reversed(list(enumerate(names)))}
     layers = [name[:-1] for name in names if name.endswith(".R") and {f"{name[:-1]}G", f"{name[:-1]}B"} <= set(names)]
@@ -65,7 +67,10 @@ def colour_channels(names: list[str], path: Path) -> tuple[list[int], int | None
 
 
 def opened(path: Path):
-    """An OpenImageIO reader that leaves colours unmultiplied by alpha."""
+    """An OpenImageIO reader that leaves colours unmultiplied by alpha.
+
+    Raises ValueError for a file that is no picture.
+    """
     import OpenImageIO as oiio
 
     settings = oiio.ImageSpec()
@@ -80,7 +85,10 @@ def opened(path: Path):
 
 
 def decode(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
-    """Pixels as stored (float32), the channels' names, and the orientation tag (1 = upright)."""
+    """Pixels as stored (float32), the channels' names, and the orientation tag (1 = upright).
+
+    Raises ValueError for a file that cannot be decoded.
+    """
     import OpenImageIO as oiio
 
     reader = opened(path)
@@ -159,7 +167,10 @@ def orientation_of(path: Path, spec) -> int:
 
 
 def decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
-    """Like :func:`decode` for HEIC photos; their decoder turns them upright itself."""
+    """Like :func:`decode` for HEIC photos; their decoder turns them upright itself.
+
+    Raises ValueError for a file that cannot be decoded.
+    """
     image = opened_heif(path)
     require_decodable(f"image {path}", image.size[1], image.size[0], 3)
     try:
@@ -174,7 +185,10 @@ def decode_heif(path: Path) -> tuple[Float[Tensor, "c h w"], list[str], int]:
 
 
 def opened_heif(path: Path):
-    """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency."""
+    """A photo opened by pillow-heif (its ``size`` is upright), an optional dependency.
+
+    Raises ValueError for a file that is no picture, and where the extra heic is not installed.
+    """
     try:
         import pillow_heif  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -199,4 +213,5 @@ def upright(pixels: Float[Tensor, "c h w"], orientation: int) -> Float[Tensor, "
 
 
 def one_line(message: str) -> str:
+    """A library's message in one line."""
     return " ".join(message.split()) or "no reason given"

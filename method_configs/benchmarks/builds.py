@@ -47,7 +47,10 @@ class Builds(TableFiles):
     """Threads of each build."""
 
     def run(self) -> None:
-        """Measure and report."""
+        """Measure and report.
+
+        Raises ValueError for options that make no benchmark.
+        """
         from fb_core.evaluation.results import Report
 
         if not (self.other / "fb_core").is_dir():

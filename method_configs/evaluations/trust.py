@@ -48,7 +48,10 @@ class Trust(TableFiles):
     """Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one."""
 
     def run(self) -> None:
-        """Generate, compare, report."""
+        """Generate, compare, report.
+
+        Raises ValueError for options that make no evaluation.
+        """
         import torch
         from rich.progress import track
 

@@ -123,7 +123,10 @@ def with_suffix(path: Path) -> Path:
 
 
 def listed_lens(where: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The same keys with nerfstudio's list of coefficients, if there is one, spread over k1, k2, k3, k4, p1, p2."""
+    """The same keys with nerfstudio's list of coefficients, if there is one, spread over k1, k2, k3, k4, p1, p2.
+
+    Raises ValueError for a list of another length, or of other things than numbers.
+    """
     listed = values.get("distortion_params")
     if listed is None or values.get("camera_model", "OPENCV") not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS):
         return values  # models that are not supported have lists of their own

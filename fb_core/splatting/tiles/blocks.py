@@ -101,7 +101,7 @@ class Scratch:
         self._layers: dict[tuple[str | int, ...], tuple[Tensor, ...]] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
-        """A tensor of that name and shape, whose memory is used again and again; its content is whatever was left there."""
+        """A tensor of that name and shape, whose memory is used again and again; it holds whatever was left there."""
         view = self._views.get((name, *shape))
         if view is None:
             size = math.prod(shape)
