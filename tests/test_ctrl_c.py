@@ -1,7 +1,7 @@
 """Ctrl-C in whole processes, as a terminal sends it to a group of its own: one line, exit code 130, nothing half written.
 
 No process is forked here, and none of the product's commands forks: a fork of a process that has threads (torch's, OpenCV's) may die of a
-segmentation fault by itself. The slow part was run on 2026-11-28.
+segmentation fault by itself. Of the slow part, `complete` was run on 2026-11-28, at ten moments of 0.5 to 7.5 s of processor time.
 """
 
 from __future__ import annotations
