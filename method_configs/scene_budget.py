@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ _WANTED_STEPS = 1500  # enough for what photos show; more time goes into larger 
 _SIDES = (64, 96, 128, 160, 240, 320, 480, 640, 960, 1280, 1920, 2560, 3840)  # of pictures that splats are trained on
 _TRAINING_SHARE, _FILM_SHARE = 0.65, 0.2  # of the time; the rest is for new views, files, and for guesses that were too low
 _PROBE_SIDE, _PROBE_SPLATS = 96, 4000
+_LEAST_SIDE = 17  # pixels of the shorter side: what is trained on has 16 at least, after rounding
 _LEAST_SECONDS = 10.0
 _ON_CPU, _ON_GPU = 20_000, 500_000  # Gaussians
 
@@ -84,7 +86,7 @@ class SceneBudget:
         side = photo_side or max(
             [one for one in _SIDES if one < longest and training(one, wanted) <= _TRAINING_SHARE * seconds] or [_SIDES[0]]
         )
-        side = min(side, longest)
+        side = min(max(side, math.ceil(_LEAST_SIDE / aspect)), longest)
         if steps is None:
             affordable = _TRAINING_SHARE * seconds / max(training(side, 1), 1e-9)
             steps = int(min(max(affordable, FEWEST_STEPS), MOST_STEPS)) // 10 * 10
