@@ -18,6 +18,7 @@ from nerfstudio.models.base_model import Model
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.paths import seen_by
 from fb_core.geometry.shell import Shell, intersect
 from fb_core.masks import resampled
@@ -95,6 +96,13 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
         groups.append(small.unproject(rendered.depth)[rendered.solid])
     points = torch.cat(groups) if groups else torch.empty(0, 3)
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
+
+
+def free_space(model: Model, cameras: Sequence[Pinholes]) -> FreeSpace:
+    """What rays of the captured cameras have crossed on their way to the surfaces that the splats show."""
+    small = [coarse(camera) for camera in cameras]
+    rendered = [render_geometry(model, camera) for camera in small]
+    return FreeSpace(cameras=tuple(small), depth=tuple(torch.where(one.solid, one.depth, 0.0)[0] for one in rendered))
 
 
 def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:
