@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import time
 from collections.abc import Iterator
@@ -41,21 +42,21 @@ from fb_core.completion.rounds import Inpainter, announcement, open_cache, run_c
 from fb_core.completion.trust import Trust, measured_trust
 from fb_core.data.capture.frames import Frame
 from fb_core.files.faults import Refused
-from fb_core.files.whole import remove_folder
+from fb_core.files.whole import remove_folder, whole_file
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_core.machine.precision import in_words
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager
 from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d, without_open3d
 from fb_nerfstudio.capture.start_points import start_points
-from fb_nerfstudio.capture.unseen import TRAINED_STEPS, seen_by_nobody_else, surface_points
+from fb_nerfstudio.capture.unseen import TRAINED_STEPS, free_space, seen_by_nobody_else, surface_points
 from fb_nerfstudio.checks.exports import refuse_empty_exports
 from fb_nerfstudio.checks.going_on import CaptureIdentity
 from fb_nerfstudio.generation.bank import Bank, without_requested
 from fb_nerfstudio.generation.first_guess import first_guess
 from fb_nerfstudio.generation.fitting_in import fitted_in, needed_by_splats
 from fb_nerfstudio.generation.missing import plan_missing
-from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn
+from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn, report_of
 from fb_nerfstudio.generation.surroundings import (
     Bars,
     LazyViews,
@@ -73,6 +74,8 @@ from fb_nerfstudio.viewer import CompletionPanel, views_in_words
 
 COMPLETION_FOLDER = "completion"
 """Where in the run's folder the generated views are written as a capture."""
+REPORT_NAME = "completion.json"
+"""Beside that folder: how far the model is believed, its rounds and the trust of every view."""
 _SURVEYED_CAMERAS = 48  # captured pictures that are rendered to learn where surfaces are when a request comes
 _logger = logging.getLogger(__name__)
 
@@ -279,7 +282,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             one = (
                 former_of(done, splats, self._rounds.number, trained=step >= TRAINED_STEPS) if in_turn(config) else None
             )
-            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts, former=one)
+            surveyed = cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)]
+            free = free_space(splats, surveyed) if one is not None and step >= TRAINED_STEPS else None
+            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts, former=one, free=free)
             if plan.covered is not None and step >= TRAINED_STEPS:
                 plan = needed_by_splats(plan, splats, cameras, self.known_parts)
         done, _ = without_requested(self.generated_views)
@@ -587,6 +592,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         except ValueError as error:
             _logger.warning("%s; the generated views are in the checkpoint alone", error)
             return None
+        with whole_file(target.folder.with_name(REPORT_NAME)) as unfinished:
+            told = report_of(self._trust, self._rounds, self.generated_views)
+            unfinished.write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
         if self.generated_views is not None:
             self.generated_views.save_capture(target)
         else:

@@ -230,10 +230,12 @@ def announcement(
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left; two where the
     capture decides.
     """
+    shows = f"The capture and the {plan.former_views} views so far show" if plan.former_views else "The capture shows"
     if plan.covered is not None and not plan.rounds:
         if plan.covered[1] > plan.covered[0]:
             return "The splats show all that new views would show already, so no view is generated."
-        return f"The capture shows {plan.covered[0]:.0%} of what surrounds it, so no view is generated."
+        more = "further " if plan.former_views else ""
+        return f"{shows} {plan.covered[0]:.0%} of what surrounds it, so no {more}view is generated."
     context = max(len(plan.context_of(one)) for one in plan.rounds)
     asked = "" if context >= config.context_views else f" (asked for {config.context_views}; the capture has no more)"
     left = [one for one in plan.rounds if done is None or one.number not in done.rounds]
@@ -249,9 +251,9 @@ def announcement(
     )
     decided = ""
     if plan.covered is not None:
-        decided = (
-            f"The capture shows {plan.covered[0]:.0%} of what surrounds it, with the new views {plan.covered[1]:.0%}. "
-        )
+        if plan.blind:
+            decided = "Nobody can tell yet where surfaces are, so new cameras stand where captured ones stood. "
+        decided += f"{shows} {plan.covered[0]:.0%} of what surrounds it, with the new views {plan.covered[1]:.0%}. "
     return decided + (
         f"Completing the scene with {model_name(config, model)} ({model.model_hash[:8]}): "
         f"{plan.new_views} new views{along} of {plan.size}x{plan.size} pixels in {passes}, "

@@ -21,6 +21,7 @@ from torch import Tensor
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import Shell, intersect
 from fb_core.geometry.viewpoints.paths import seen_by
 from fb_core.masks import resampled
@@ -106,6 +107,13 @@ def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20
         groups.append(small.unproject(rendered.depth)[rendered.solid])
     points = torch.cat(groups) if groups else torch.empty(0, 3)
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
+
+
+def free_space(model: Model, cameras: Sequence[Pinholes]) -> FreeSpace:
+    """What rays of the captured cameras have crossed on their way to the surfaces that the splats show."""
+    small = [coarse(camera) for camera in cameras]
+    rendered = [render_geometry(model, camera) for camera in small]
+    return FreeSpace(cameras=tuple(small), depth=tuple(torch.where(one.solid, one.depth, 0.0)[0] for one in rendered))
 
 
 def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:

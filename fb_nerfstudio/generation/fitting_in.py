@@ -81,8 +81,18 @@ def fitted_in(
     if holes_only and rendered is not None:
         unseen = dataclasses.replace(unseen, mask=unseen.mask & (rendered.accumulation < SOLID))
     generator = torch.Generator().manual_seed(config.seed)
-    points, colors = unseen_gaussians(views, unseen, limit=config.max_seed_gaussians, generator=generator)
+    points, colors = unseen_gaussians(
+        views, unseen, limit=_room(splats, config.max_seed_gaussians), generator=generator
+    )
     return views, splats.add_gaussians(points, colors, optimizers) if len(points) else 0
+
+
+def _room(splats: Any, most: int) -> int:
+    """How many Gaussians generated views may get: half of what the cap leaves free. The other half is for what the
+    capture still grows.
+    """
+    cap = getattr(getattr(splats, "config", None), "max_gaussians", None)
+    return most if cap is None else min(most, max(0, cap - splats.num_points) // 2)
 
 
 def needed_by_splats(

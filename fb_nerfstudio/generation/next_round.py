@@ -61,6 +61,17 @@ class Rounds:
         return Rounds(number=int(state["number"]), due=int(state["due"]), record=tuple(state["record"]))
 
 
+def report_of(trust: Trust | None, rounds: Rounds, views: CompletedViews | None) -> dict[str, Any]:
+    """What a run's report holds of its completion: how far the model is believed and why, the rounds, and every view's
+    mean trust.
+    """
+    each = (
+        [] if views is None else [{"round": one.round, "role": one.role, "trust": one.trust} for one in views.origins]
+    )
+    measured = None if trust is None else {"value": trust.value, "in_words": trust.in_words, **trust.state()}
+    return {"trust": measured, "rounds": [dict(one) for one in rounds.record], "views": each}
+
+
 def in_turn(config: CompletionConfig) -> bool:
     """Whether rounds are planned one after the other: where the capture decides what is generated."""
     return config.task == "new-views" and config.anchor_views is None and config.camera_path is None

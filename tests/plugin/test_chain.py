@@ -248,9 +248,9 @@ def test_ns_export_of_nothing_and_of_rays_is_one_sentence(chain: Chain, tmp_path
     far = exporter.ExportGaussianSplat(
         load_config=chain.config_file,
         output_dir=tmp_path,
-        obb_center=(99, 99, 99),
-        obb_rotation=(0, 0, 0),
-        obb_scale=(1, 1, 1),
+        obb_center=(99.0, 99.0, 99.0),
+        obb_rotation=(0.0, 0.0, 0.0),
+        obb_scale=(1.0, 1.0, 1.0),
     )
     with pytest.raises(Refused, match="no Gaussian is left to write; choose a larger box"):
         far.main()

@@ -24,6 +24,7 @@ from fb_core.completion.planning.path_candidates import with_path
 from fb_core.completion.results.completed_views import ANCHOR, DENSIFY
 from fb_core.data.capture.camera_path import read_camera_path
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import Shell, fit_shell, sphere
 from fb_core.geometry.viewpoints.coverage import Coverage, choose_views
 from fb_core.geometry.viewpoints.paths import (
@@ -42,6 +43,7 @@ _ANCHOR_LEVELS, _DENSIFY_LEVELS = 2, 3
 _SEEN_NEED = 0.2  # looking at what the capture has seen is worth this much of looking at what it has not
 _PLANNING_POINTS = 4000
 _BEYOND = 1.25  # how far off an object new cameras may stand, in the distance of the farthest captured one
+_FEWEST_POINTS = 16  # seen points; of fewer, nobody can tell where surfaces are
 _PLACES, _CAPTURED_PLACES = 24, 16  # where candidates stand: new places for each role, and captured ones
 
 
@@ -97,6 +99,12 @@ class CompletionPlan:
     """Share of what surrounds the capture that its pictures (and generated views so far) show, and that the new views
     show besides; None where nobody asked.
     """
+    blind: bool = False
+    """Whether nobody knows where surfaces are, so that new cameras stay at captured places (where the capture
+    decides).
+    """
+    former_views: int = 0
+    """Views that were generated in rounds before this plan's."""
     coverage: Coverage | None = None
     """Points all over what surrounds the capture, and which of them are seen before these rounds; None where nobody
     asked.
@@ -131,6 +139,7 @@ def plan_completion(
     size: int,
     known: Sequence[Bool[Tensor, "_h _w"] | None] | None = None,
     former: Former | None = None,
+    free: FreeSpace | None = None,
 ) -> CompletionPlan:
     """Choose context views and new cameras.
 
@@ -147,6 +156,8 @@ def plan_completion(
         known: of each captured picture its known part (a mask of any size, None for all of it); without, all of them
             are known.
         former: where the capture decides, plan the one round that follows these; None plans all rounds at once.
+        free: space that is known to be free, in which cameras of captures that look outward stand; None where nobody
+            knows.
     """
     cameras = [camera.to("cpu", torch.float64) for camera in cameras]  # a scene may lie far from the origin
     shape = CaptureShape.of(cameras)
@@ -158,6 +169,7 @@ def plan_completion(
         cameras=cameras,
         known=known,
         placement=config.placement,
+        free=free,
     )
     count = config.context_views
     context = (
@@ -182,6 +194,8 @@ def plan_completion(
         size=size,
         covered=covered,
         coverage=coverage,
+        blind=site.blind and site.shape.outward and config.placement.clearance > 0,
+        former_views=0 if former is None else len(former.cameras),
     )
 
 
@@ -311,6 +325,12 @@ class _Site:
     cameras: list[Pinholes]
     known: Sequence[Bool[Tensor, "_h _w"] | None] | None
     placement: PlacementConfig
+    free: FreeSpace | None = None
+
+    @property
+    def blind(self) -> bool:
+        """Whether nobody knows where surfaces are: no point was seen, and no splats are trained."""
+        return len(self.points) < _FEWEST_POINTS and (self.free is None or not self.free.is_known)
 
     def surface(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
         """Points all over the shell, and their directions from its centre."""
@@ -352,6 +372,7 @@ class _Site:
             points=self.points,
             clearance=placement.clearance * typical,
             refuges=refuges,
+            free=self.free if shape.outward and self.free is not None and self.free.is_known else None,
         )
 
     def _bounds(self, standing: Float[Tensor, "n 3"]) -> Shell:
@@ -367,6 +388,8 @@ class _Site:
         chosen = spread_subset(self.cameras, _CAPTURED_PLACES)
         standing = torch.cat([self.cameras[index].centers for index in chosen])
         around = [self.centers(role, _PLACES, generator) for role in (ANCHOR, DENSIFY)]
+        if self.blind and self.shape.outward and self.placement.clearance > 0:
+            around = []  # a wall may stand anywhere but where somebody stood
         if self.shape.outward:
             surface, directions = self.surface()
             weight = 1.0 - 0.6 * (directions @ self.shape.up) ** 2  # as `need`

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import Shell
 
 _CONVERGING = (
@@ -141,9 +142,10 @@ def kept_clear(
     points: Float[Tensor, "m 3"],
     clearance: float,
     refuges: Float[Tensor, "k 3"],
+    free: FreeSpace | None = None,
 ) -> Float[Tensor, "n 3"]:
-    """Pull camera centres out of what the capture has seen: inside the shell, and ``clearance`` away from every seen
-    point.
+    """Pull camera centres out of what the capture has seen: inside the shell, ``clearance`` away from every seen point,
+    and in space that is known to be free, if that is known.
 
     A blocked centre moves straight towards the nearest captured camera (a ``refuge``: somebody stood there) in eighths
     of the way, and stops at the first clear place; the last resort is the captured place itself.
@@ -164,6 +166,8 @@ def kept_clear(
         clear = shell.contains(place, margin=0.9)
         if len(points):
             clear &= distances(place, points).min(dim=1).values >= clearance
+        if free is not None:
+            clear &= free.crossed(place)
         chosen = clear & ~settled
         result[chosen] = place[chosen]
         settled |= clear

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ _TRAINING_SHARE, _FILM_SHARE = (
     0.2,
 )  # of the time; the rest is for new views, files, and for guesses that were too low
 _PROBE_SIDE, _PROBE_SPLATS = 96, 4000
+_LEAST_SIDE = 17  # pixels of the shorter side: what is trained on has 16 at least, after rounding
 _LEAST_SECONDS = 10.0
 _ON_CPU, _ON_GPU = 20_000, 500_000  # Gaussians
 
@@ -88,7 +90,7 @@ class SceneBudget:
             [one for one in _SIDES if one < longest and training(one, wanted) <= _TRAINING_SHARE * seconds]
             or [_SIDES[0]]
         )
-        side = min(side, longest)
+        side = min(max(side, math.ceil(_LEAST_SIDE / aspect)), longest)
         if steps is None:
             affordable = _TRAINING_SHARE * seconds / max(training(side, 1), 1e-9)
             steps = int(min(max(affordable, FEWEST_STEPS), MOST_STEPS)) // 10 * 10

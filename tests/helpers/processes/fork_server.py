@@ -246,6 +246,7 @@ def _ns_train(options: dict[str, Any]) -> None:
     config.max_num_iterations, config.steps_per_save, config.steps_per_eval_image = options["iterations"], 3, 10**6
     manager: Any = config.pipeline.datamanager
     manager.completion.at_step = options["at_step"]
+    manager.completion.trust = "full"  # the trial on hidden views calls the model too, and is no round
     if options.get("cache"):
         manager.completion.cache_dir = Path(options["cache"])
     if options.get("load_dir"):

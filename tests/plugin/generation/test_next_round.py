@@ -5,6 +5,7 @@ little is left.
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,7 +18,9 @@ from helpers.trust_parts import views_of
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import CompletionPlan, Former, plan_completion
 from fb_core.completion.trust import Trust
+from fb_core.files.json_files import read_json
 from fb_core.geometry.cameras import Pinholes
+from fb_nerfstudio.generation.fitting_in import _room
 from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn
 
 __all__ = ["stand_in_model"]  # no test here loads real weights
@@ -150,3 +153,24 @@ def test_a_training_that_ends_before_the_next_round_is_due_gets_it_at_once(tiny_
     assert manager.get_extra_state()["finished"] and {
         one["step"] for one in manager.get_extra_state()["rounds"]["record"]
     } == {200}
+
+
+def test_the_run_s_report_tells_trust_rounds_and_views(tiny_capture, tmp_path) -> None:
+    manager = make(tiny_capture, options(context_views=4, trust="measured"))
+    ran(manager, tmp_path, [0])
+    told = read_json(tmp_path / "completion.json")
+    assert (
+        told["trust"]["hidden"] == 1
+        and "hidden view" in told["trust"]["in_words"]
+        and told["trust"]["curve"]["baseline"] > 0
+    )
+    assert [one["trust"] for one in told["views"]] == [origin.trust for origin in manager.generated_views.origins]
+
+
+@pytest.mark.parametrize(
+    ("cap", "there", "most", "room"),
+    [(None, 10, 500, 500), (100, 60, 500, 20), (100, 60, 7, 7), (100, 100, 9, 0), (100, 120, 9, 0)],
+)
+def test_generated_gaussians_leave_half_of_what_the_cap_leaves_to_the_capture(cap, there, most, room) -> None:
+    assert _room(SimpleNamespace(config=SimpleNamespace(max_gaussians=cap), num_points=there), most) == room
+    assert _room(SimpleNamespace(), most) == most

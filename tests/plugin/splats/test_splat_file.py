@@ -182,5 +182,7 @@ def test_more_time_never_makes_less_and_what_is_given_is_kept() -> None:
         assert less.photo_side <= more.photo_side <= 1920 and less.film_side <= more.film_side <= 1920
     for seconds, one in zip((120, 300, 1200, 10000), several[2:], strict=True):
         assert one.seconds <= seconds
+    strip = SceneBudget.of(1, speed, frames=1, longest=2000, aspect=0.1, device="cpu")
+    assert int(strip.photo_side * 0.1) >= 16  # what is trained on has 16 pixels at least
     given = budget(300, steps=12, photo_side=100, film_side=5000)
     assert (given.schedule.steps, given.photo_side, given.film_side) == (12, 100, 1920)

@@ -1,0 +1,44 @@
+"""Space that is known to be free: rays of captured pictures have crossed it on their way to what they show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+
+_SHARE = 0.9  # of the way to a surface that counts as crossed, which leaves room for errors of depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSpace:
+    """What rays have crossed from each camera to the surface that it shows."""
+
+    cameras: tuple[Pinholes, ...]
+    """One each, with small pictures."""
+    depth: tuple[Float[Tensor, "_h _w"], ...]
+    """z-depth of the surface in each of their pixels; 0 or not finite where it is not known."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any ray is known to have reached a surface."""
+        return any(bool((torch.isfinite(one) & (one > 0)).any()) for one in self.depth)
+
+    def crossed(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether a ray of some picture has passed each point well before the surface that it shows; memory does not
+        grow with pictures.
+        """
+        result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        for camera, depth in zip(self.cameras, self.depth, strict=True):
+            pixels, away = camera.to(points).project(points)
+            cell = pixels[0].nan_to_num(-1.0).floor()
+            inside = (
+                (cell >= 0).all(dim=-1) & (cell[:, 0] < depth.shape[1]) & (cell[:, 1] < depth.shape[0]) & (away[0] > 0)
+            )
+            column, row = cell[inside].long().unbind(dim=-1)
+            surface = depth[row, column].to(points)
+            result[inside] |= torch.isfinite(surface) & (away[0][inside] < _SHARE * surface)
+        return result
