@@ -125,7 +125,7 @@ class SamplingConfig:
         """When a latent joins of which the current views tell so much, 0 to 1: at the strength where wholly, at 1
         (noise) where nothing.
         """
-        return 1.0 - share * (1.0 - self.strength)
+        return self.strength + (1.0 - share) * (1.0 - self.strength)  # exactly the strength where wholly
 
     def times_from_noise_through(self, shares: Sequence[float]) -> list[float]:
         """`times_from_noise_too`, through the times at which latents of these shares join."""
