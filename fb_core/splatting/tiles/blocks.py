@@ -230,7 +230,7 @@ class Stretch:
 def _evaluate(
     table: Table,
     step: Step,
-    centers: Float[Tensor, "2 1 s"],
+    centers: Float[Tensor, "2 1 widest"],
     light: Float[Tensor, "2 s p"],
     scratch: Scratch,
     *,
