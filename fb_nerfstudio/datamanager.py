@@ -620,7 +620,7 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         self._finished = bool(state["finished"])
         self.captured_draws = int(state["captured_draws"])
         self._outdated = [int(number) for number in state.get("outdated", ())]
-        self._trust = None if state.get("measured") is None else Trust.from_state(state["measured"])
+        self._trust = Trust.restored(state.get("measured"), state.get("trust"))
         if (
             state.get("start_points") is not None
         ):  # not triangulated again: interrupted rounds are planned from the very same points

@@ -74,6 +74,13 @@ class Trust:
             curve = Curve(weights=tuple(told["weights"]), usual=tuple(told["usual"]), baseline=float(told["baseline"]))
         return Trust(hidden=int(state["hidden"]), curve=curve, **errors)
 
+    @staticmethod
+    def restored(state: dict[str, Any] | None, value: float | None) -> Trust | None:
+        """What a checkpoint holds; one of an earlier version knows the value alone."""
+        if state is not None:
+            return Trust.from_state(state)
+        return None if value is None else Trust(hidden=1, model=1 - float(value), mean=1.0, nearest=1.0)
+
     @property
     def value(self) -> float:
         """Share of the better baseline's error that the model does away with, from `LEAST` to 1; 1 where nothing could

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.data.capture.layouts import other_tool
 from fb_core.data.training.capture_sequences import (
     CaptureConfig,
     TrainingCapture,
@@ -68,6 +69,8 @@ def capture_folders(data: Path) -> list[Path]:
 
 def looks_like(folder: Path) -> tuple[str, str]:
     """What a folder without captures seems to be, and what turns it into one."""
+    if (other := other_tool(folder)) is not None:
+        return other
     files = [path for path in found_below(folder, "*")[:10_000] if path.is_file()]
     names, suffixes = {path.name for path in files}, {path.suffix.lower() for path in files}
     if names & {"cameras.bin", "cameras.txt"}:

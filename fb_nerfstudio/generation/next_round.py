@@ -68,7 +68,11 @@ def report_of(trust: Trust | None, rounds: Rounds, views: CompletedViews | None)
     each = (
         [] if views is None else [{"round": one.round, "role": one.role, "trust": one.trust} for one in views.origins]
     )
-    measured = None if trust is None else {"value": trust.value, "in_words": trust.in_words, **trust.state()}
+    measured = None
+    if trust is not None:
+        measured = {"value": trust.value}
+        if trust.curve is not None or not trust.hidden:  # else a run of an earlier version, which kept the value alone
+            measured |= {"in_words": trust.in_words, **trust.state()}
     return {"trust": measured, "rounds": [dict(one) for one in rounds.record], "views": each}
 
 

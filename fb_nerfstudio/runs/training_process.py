@@ -43,6 +43,7 @@ class TrainingProcess:
         self._iterations, self._rounds, self._report = iterations, rounds, report
         self._began = time.monotonic()
         self._generating_since: float | None = None
+        self._generated = 0.0  # seconds of generations that are over
         self._tail = ""  # of what it prints, also where its log cannot be written
         self._unwritten: CannotWrite | None = None
         # A forced terminal makes rich print the bars of the generation into the pipe, where they are read below.
@@ -120,10 +121,14 @@ class TrainingProcess:
         if denoised is not None and (trained is None or denoised.end() > trained.end()):
             now = time.monotonic()
             self._generating_since = self._generating_since or now
-            self.seconds["generate"] = now - self._generating_since
+            self.seconds["generate"] = self._generated + now - self._generating_since
             done, total = int(denoised[2]), int(denoised[3])
             self._report("generate", int(denoised[1] or 0) * total + done, self._rounds * total)
         elif trained is not None:
+            self._generated, self._generating_since = (
+                self.seconds["generate"],
+                None,
+            )  # rounds may have training between them
             self._report("train", min(int(trained[1]) + 1, self._iterations), self._iterations)
 
 

@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from gsplat.strategy.ops import remove
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.model_components import renderers
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid, color_correct, total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
@@ -33,6 +35,7 @@ from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.densification import CappedStrategy, append_rows
 from fb_nerfstudio.splats.gaussians import evenly_chosen, gaussians_at, random_points
 from fb_nerfstudio.splats.mcmc import CappedMCMC, penalize
+from fb_nerfstudio.splats.panoramas import draw_panorama, is_panorama
 
 logger = logging.getLogger(__name__)
 
@@ -257,6 +260,13 @@ class FillerbusterSplatModel(SplatfactoModel):
         Normals are pictures in [0, 1] (see ``normal_picture``). Training renders depth and normals only when a loss or
         ``output_depth_during_training`` needs them. Raises ValueError for anything but one camera.
         """
+        if (
+            not self.training
+            and isinstance(camera, Cameras)
+            and camera.camera_to_worlds.numel() == 12
+            and is_panorama(camera)
+        ):
+            return draw_panorama(camera, self.get_outputs)
         pinhole = self._pinhole(camera)
         self.last_size = (pinhole.height, pinhole.width)
         background = self._get_background_color()
@@ -316,14 +326,13 @@ class FillerbusterSplatModel(SplatfactoModel):
                 else type(camera).__name__
             )
             raise ValueError(f"camera: expected one nerfstudio camera, got {got}; render cameras one by one")
-        if not self.training and int(camera.camera_type.item()) != CameraType.PERSPECTIVE.value:
-            # ns-render and the viewer offer panoramas to every method; splats are drawn in perspective, as splatfacto
-            # does.
-            camera = dataclasses.replace(
-                camera, camera_type=torch.full_like(camera.camera_type, CameraType.PERSPECTIVE.value)
-            )
         # ns-render reads the focal lengths of camera paths in double precision.
         pinhole = to_pinholes(camera).to(self.device, self.means.dtype)
+        if not self.training:  # paths of scaled scenes (nerfstudio's Blender add-on) carry the scale in their rotations
+            turn = F.normalize(pinhole.rotations, dim=1)
+            pinhole = dataclasses.replace(
+                pinhole, camera_to_world=torch.cat([turn, pinhole.camera_to_world[:, :, 3:]], dim=2)
+            )
         if self.training:
             corrected = self.camera_optimizer.apply_to_camera(camera).reshape(-1, 3, 4)
             pinhole = dataclasses.replace(pinhole, camera_to_world=flip_axes(corrected))
@@ -338,6 +347,11 @@ class FillerbusterSplatModel(SplatfactoModel):
             width=pinhole.width // factor,
             height=pinhole.height // factor,
         )
+
+    def _get_background_color(self) -> Tensor:
+        """As in splatfacto; renders of a camera path with a crop have the crop's own."""
+        override = None if self.training else renderers.BACKGROUND_COLOR_OVERRIDE
+        return super()._get_background_color() if override is None else override.to(self.device)
 
     def _cropped_splats(self) -> dict[str, Tensor]:
         """The Gaussians' parameters; in evaluation those inside the crop box, if there is one."""

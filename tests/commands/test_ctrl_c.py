@@ -77,7 +77,12 @@ def commands(inputs: tuple[Path, Path]) -> dict[str, list[str]]:
 
 def started(program: str, arguments: Sequence[str], folder: Path) -> subprocess.Popen[str]:
     """In a process group of its own, so that what is sent there reaches nobody else."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "CUDA_VISIBLE_DEVICES": "",
+        "OMP_NUM_THREADS": "1",
+        "COLUMNS": "1000",
+    }
     command = [sys.executable, "-c", program, *arguments]
     return subprocess.Popen(
         command,

@@ -23,6 +23,7 @@ from helpers.plugin.datamanagers import (
     make,
     options,
     run_callbacks,
+    stand_in_model,  # noqa: F401
     toy_viewer,
     two_views,
 )

@@ -69,7 +69,12 @@ def read_capture(folder: str | Path) -> Capture:
         ValueError: one sentence, for a missing folder or file, bad JSON, no frames, and bad or missing poses and
             intrinsics.
     """
-    from fb_core.data.capture.layouts import Layout, layout_of, read_layout  # which reads into the types of this module
+    from fb_core.data.capture.layouts import (  # which read into the types of this module
+        Layout,
+        layout_of,
+        other_tool,
+        read_layout,
+    )
 
     path = Path(folder)
     if not path.exists():
@@ -77,6 +82,8 @@ def read_capture(folder: str | Path) -> Capture:
     if not path.exists():
         raise ValueError(f"capture {path}: no such folder; check the path")
     layout = layout_of(path) if path.is_dir() else Layout(kind="transforms", path=path)
+    if layout is None and (other := other_tool(path)) is not None:
+        raise ValueError(f"capture {path}: this is {other[0]}, which is not read; {other[1]}")
     if layout is None:
         raise ValueError(
             f"capture {path}: no {JSON_NAME} in this folder, no transforms_train.json and no COLMAP model (sparse/0); "

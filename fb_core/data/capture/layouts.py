@@ -21,7 +21,7 @@ from fb_core.data.capture.colmap.lenses import lens_of
 from fb_core.data.capture.colmap.model import rotations_of
 from fb_core.data.capture.colmap.reader import ColmapPose, has_model, model_size, points_file, read_model
 from fb_core.data.capture.frames import Capture, Frame, read_transforms
-from fb_core.data.capture.transforms_json import JSON_NAME
+from fb_core.data.capture.transforms_json import JSON_NAME, with_suffix
 from fb_core.files.json_files import read_json
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
@@ -47,6 +47,41 @@ _UPWARDS = 4  # folders above a model in which its pictures are looked for
 _REDUCED = re.compile(r"images_(\d+)")
 _IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
 _PROVENANCE = "frames.json"  # beside the COLMAP models of fillerbuster export
+_COLMAP_EXPORT = "export the cameras as a COLMAP text model"
+_OTHER_TOOLS = (  # a file that tells the tool, the tool, what to do
+    ("keyframes/cameras", "Polycam's raw data", "run ns-process-data polycam"),
+    ("keyframes/corrected_cameras", "Polycam's raw data", "run ns-process-data polycam"),
+    ("EXR_RGBD/metadata", "Record3D's data", "run ns-process-data record3d"),
+    ("*.r3d", "a Record3D recording", "export it as EXR + RGB and run ns-process-data record3d"),
+    ("rgbd/0.conf", "Record3D's data", "run ns-process-data record3d"),
+    (
+        "poses_bounds.npy",
+        "an LLFF capture without its COLMAP model",
+        "put the model's folder sparse/0 beside its images",
+    ),
+    ("opensfm/reconstruction.json", "an OpenDroneMap project", "run ns-process-data odm"),
+    ("reconstruction.json", "an OpenSfM project", "export it with opensfm export_colmap"),
+    ("sfm_data.json", "an OpenMVG project", "export it with openMVG_main_openMVG2Colmap"),
+    ("*.nvm", "a VisualSFM model", "convert it to a COLMAP model"),
+    ("bundle.out", "a Bundler model", "convert it to a COLMAP model"),
+    ("cfg_args", "a trained model of 3D Gaussian splatting", "give the folder of the pictures that it was trained on"),
+    ("cameras.xml", "a Metashape export", "run ns-process-data metashape"),
+    ("doc.xml", "a Metashape project", _COLMAP_EXPORT),
+    ("*.psx", "a Metashape project", _COLMAP_EXPORT),
+    ("*.rcproj", "a RealityCapture project", _COLMAP_EXPORT),
+    ("*.rspj", "a RealityScan project", _COLMAP_EXPORT),
+    ("lowres_wide.traj", "an ARKitScenes scan", "use ns-train's arkit-data subcommand"),
+    ("color/0.jpg", "a ScanNet scan", "use ns-train's scannet-data subcommand"),
+    ("dataset.json", "a Nerfies or HyperNeRF capture", "use ns-train's dycheck-data subcommand"),
+    ("cameras_sphere.npz", "a DTU scan", "use ns-train's sdfstudio-data subcommand after its conversion"),
+    ("intrinsics.txt", "an NSVF scene", "convert it to transforms.json"),
+    ("pair.txt", "an MVSNet scene", "convert it to a COLMAP model"),
+    (
+        "database.db",
+        "a COLMAP project without a sparse model",
+        "run colmap mapper, or fillerbuster complete on its folder of pictures",
+    ),
+)
 _logger = logging.getLogger(__name__)
 
 
@@ -100,12 +135,29 @@ def layouts_below(folder: Path) -> list[Path]:
     return sorted(found)
 
 
+def other_tool(folder: Path) -> tuple[str, str] | None:
+    """(what a folder is, what turns it into a capture) for folders of other tools that are not read; None for those not
+    known.
+    """
+    for pattern, kind, remedy in _OTHER_TOOLS:
+        if next(folder.glob(pattern), None) is not None:
+            return kind, remedy
+    return None
+
+
 # ---- Blender: one file for each split --------------------------------------------------------------------------------
 
 
 def _read_blender(path: Path) -> Capture:
     """transforms_train.json and those beside it, with the splits as lists."""
     captures = {split: read_transforms(path.with_name(name)) for split, name in _splits(path)}
+    times = {frame.extra.get("time") for capture in captures.values() for frame in capture.frames}
+    if len(times) > 1:
+        _logger.warning(
+            "capture %s: its frames have %d different times; what moves in them is taken as standing still",
+            path,
+            len(times),
+        )
     frames: dict[Path, Frame] = {}
     for capture in captures.values():
         for frame in capture.frames:
@@ -191,9 +243,10 @@ def _read_colmap(model: Path) -> Capture:
     """The pictures of a model that are there, with masks where a folder ``masks`` has them."""
     cameras, poses = read_model(model)
     pictures, root, reduced = _pictures_of(model, poses)
-    there = [pose for pose in poses if (pictures / pose.name).is_file()]
+    files = {pose.name: with_suffix(pictures / pose.name) for pose in poses}
+    there = [pose for pose in poses if files[pose.name].is_file()]
     if len(there) < len(poses):
-        gone = next(pose.name for pose in poses if not (pictures / pose.name).is_file())
+        gone = next(pose.name for pose in poses if not files[pose.name].is_file())
         _logger.warning(
             "capture %s: %d of %d pictures are missing, such as %s; left out",
             root,
@@ -215,9 +268,9 @@ def _read_colmap(model: Path) -> Capture:
         )
         frames.append(
             Frame(
-                image_path=pictures / pose.name,
+                image_path=files[pose.name],
                 mask_path=_mask_of(root / "masks", pose.name),
-                camera=_of_size_on_disk(pinhole, pictures / pose.name),
+                camera=_of_size_on_disk(pinhole, files[pose.name]),
                 distortion=lens.distortion,
                 camera_model=lens.camera_model,
                 extra=told.get(pose.name, {}),
@@ -247,7 +300,7 @@ def _pictures_of(model: Path, poses: list[ColmapPose]) -> tuple[Path, Path, int]
             path.name: int(found[1]) for path in folder.glob("images_*") if (found := _REDUCED.fullmatch(path.name))
         }
         places = [*((name, 1) for name in _PICTURES), *sorted(reduced.items(), key=lambda pair: pair[1])]
-        counts = [sum((folder / name / pose.name).is_file() for pose in poses) for name, _ in places]
+        counts = [sum(with_suffix(folder / name / pose.name).is_file() for pose in poses) for name, _ in places]
         if max(counts):
             name, factor = places[counts.index(max(counts))]
             return (folder if name == "." else folder / name), _folder_of(model) if folder == model else folder, factor

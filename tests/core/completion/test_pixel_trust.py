@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.plugin.splat_models import SIZE, camera, make_batch, make_model, make_optimizers
 from helpers.scenes.completions import room_cameras
-from helpers.trust_parts import CONFIG, Knows, views_of
+from helpers.scenes.trusted import CONFIG, Knows, views_of
 
 from fb_core.completion.brought_views import brought_views
 from fb_core.completion.pixel_trust import (
@@ -225,6 +225,11 @@ def test_the_sentence_tells_the_splats_too_and_a_measurement_survives_as_plain_v
     assert Trust.from_state(told.state()) == told
     nothing = Trust.from_state(Trust(hidden=0, model=math.nan, mean=math.nan, nearest=math.nan).state())
     assert nothing.value == 1.0 and nothing.curve is None
+    old = Trust.restored(None, 0.43)
+    assert old is not None and old.value == pytest.approx(0.43) and old.curve is None, (
+        "a checkpoint of an earlier version"
+    )
+    assert Trust.restored(told.state(), told.value) == told and Trust.restored(None, None) is None
 
 
 # ---- in the training ------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import math
 import pytest
 import torch
 from helpers.scenes.completions import room_cameras
-from helpers.trust_parts import CONFIG, Knows, views_of
+from helpers.scenes.trusted import CONFIG, Knows, views_of
 
 from fb_core.completion.results.cache import CompletionCache
 from fb_core.completion.results.completed_views import CompletedViews

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.coverage_parts import AUTO, turning
-from helpers.next_round_parts import TURNS
 from helpers.plugin.datamanagers import GreyFiller, attributes, make, options, run_callbacks, stand_in_model
+from helpers.plugin.rounds import TURNS
 from helpers.scenes.completions import box_points
-from helpers.trust_parts import views_of
+from helpers.scenes.coverages import AUTO, turning
+from helpers.scenes.trusted import views_of
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import CompletionPlan, Former, plan_completion

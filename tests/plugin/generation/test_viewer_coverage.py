@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from helpers.next_round_parts import TURNS
 from helpers.plugin.datamanagers import GreyFiller, attributes, make, options, run_callbacks, stand_in_model, toy_viewer
-from helpers.trust_parts import views_of
+from helpers.plugin.rounds import TURNS
+from helpers.scenes.trusted import views_of
 
 from fb_core.completion.requests import MOST_VIEWS, CompleteMissing
 from fb_nerfstudio.viewer_coverage import picture_of

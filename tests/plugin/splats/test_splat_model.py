@@ -13,7 +13,7 @@ import pytest
 import torch
 from helpers.plugin.splat_models import SIZE, camera, held, make_batch, make_model, make_optimizers, train_step
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
@@ -200,15 +200,12 @@ def test_a_wall_of_discs_has_its_normal_twice() -> None:
     assert torch.allclose(outputs["depth"][inside], torch.full((24, 24, 1), 3.0), atol=0.02)
 
 
-def test_only_one_camera_and_panoramas_are_drawn_in_perspective() -> None:
+def test_only_one_camera_is_drawn_at_a_time() -> None:
     model = make_model().eval()
     with pytest.raises(ValueError, match="2 cameras"):
         model.get_outputs(Cameras(torch.eye(4)[None, :3].repeat(2, 1, 1), 20.0, 20.0, 8.0, 8.0, 16, 16))
     with pytest.raises(ValueError, match="NoneType"):
         model.get_outputs(None)
-    panorama = camera()
-    panorama.camera_type[:] = CameraType.EQUIRECTANGULAR.value
-    assert torch.equal(model.get_outputs_for_camera(panorama)["rgb"], model.get_outputs_for_camera(camera())["rgb"])
 
 
 # ------------------------------------------------------------------------------------------------------ masks, weights

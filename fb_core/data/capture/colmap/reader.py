@@ -7,6 +7,7 @@ those. Every fault is one sentence.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -209,11 +210,15 @@ def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def _text_images(path: Path) -> list[ColmapPose]:
-    lines = _lines(path)
-    first = next((place for place, line in enumerate(lines) if line.strip()), len(lines))
-    poses = []
-    for line in lines[first::2]:  # every second line lists the features of a picture
-        if not line.strip():
+    poses, features = [], False
+    for line in _lines(path):
+        if features and (
+            not line.strip() or _is_of_features(line)
+        ):  # the line after a picture's; some tools leave it out
+            features = False
+            continue
+        features = bool(line.strip())
+        if not features:
             continue
         words = line.split(maxsplit=9)
         try:
@@ -221,6 +226,17 @@ def _text_images(path: Path) -> list[ColmapPose]:
         except (ValueError, IndexError) as error:
             raise (error if "COLMAP" in str(error) else _not_a_line(path, line)) from None
     return poses
+
+
+def _is_of_features(line: str) -> bool:
+    """Whether a line holds places of features with the numbers of their points, and is no picture's, which ends with a
+    name.
+    """
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and (int(words[-1]) >= -1 and all(math.isfinite(float(word)) for word in words[:12]))
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:

@@ -21,7 +21,8 @@ from fb_core.data.capture.colmap.lenses import lens_of, projected
 from fb_core.data.capture.colmap.reader import CAMERA_MODELS, ColmapCamera
 from fb_core.data.capture.frames import Capture
 from fb_core.data.capture.layouts import layouts_below
-from fb_core.data.capture.points import read_points
+from fb_core.data.capture.own_files import own_points
+from fb_core.data.capture.points import copy_points, read_points
 from fb_core.data.capture.undistort import straight_directions
 from fb_core.data.photos.collection import read_photos
 from fb_core.geometry.cameras import Pinholes
@@ -76,6 +77,18 @@ def test_a_colmap_model_is_the_capture_that_it_was_made_from(
     photos = read_photos(folder)
     assert len(photos) == len(theirs) and all(photo.camera is not None for photo in photos)
     assert files_of(folder) == before, "the user's files are as they were"
+
+
+def test_points_of_a_model_go_into_other_folders_as_a_ply_file(tiny_capture: Path, tmp_path: Path) -> None:
+    """As complete and export copy them."""
+    capture = read_capture(colmap_capture(tmp_path / "scene", read_capture(tiny_capture)))
+    own = own_points(capture)
+    assert own is not None and own == capture.points_path
+    copy_points(own, tmp_path / "points3D.ply")
+    there, here = read_points(tmp_path / "points3D.ply"), read_points(own)
+    assert torch.allclose(there.positions, here.positions, atol=1e-6) and torch.allclose(
+        there.colors, here.colors, atol=1e-6
+    )
 
 
 def test_a_model_is_read_from_its_own_folder_and_from_pictures_that_lie_beside_it(

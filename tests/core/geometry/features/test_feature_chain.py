@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers.feature_chain_parts import SIZE, around, bundle, cloud, lenses, perturbed, rotations_of, seen
+from helpers.scenes.features import SIZE, around, bundle, cloud, lenses, perturbed, rotations_of, seen
 
 from fb_core.evaluation.metrics.pose_metrics import pose_errors
 from fb_core.geometry.cameras import Pinholes

@@ -13,7 +13,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.feature_chain_parts import around, bundle, cloud, lenses, perturbed, seen
+from helpers.scenes.features import around, bundle, cloud, lenses, perturbed, seen
 
 from fb_core.evaluation.metrics.pose_metrics import aligned, pose_errors
 from fb_core.geometry.cameras import Pinholes

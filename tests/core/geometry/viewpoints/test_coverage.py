@@ -9,8 +9,8 @@ import math
 
 import pytest
 import torch
-from helpers.coverage_parts import AUTO, UP, turning
 from helpers.scenes.completions import MeanFiller, box_points
+from helpers.scenes.coverages import AUTO, UP, turning
 
 from fb_core.completion.planning.plan import plan_completion
 from fb_core.completion.rounds import announcement

@@ -1,4 +1,4 @@
-"""What test_coverage shares."""
+"""Options and turns of cameras for tests of what a capture shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What test_feature_chain shares."""
+"""Photos of points in space, as features would tell of them."""
 
 import dataclasses
 import math

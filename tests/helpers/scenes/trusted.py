@@ -1,16 +1,16 @@
-"""What test_trust shares."""
+"""Models that know the scene or nothing of it."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import torch
+from helpers.scenes.completions import MeanFiller, room_cameras
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import CompletedViews, Origin
 from fb_core.completion.rounds import CapturedView, fitted_view
 from fb_core.views import Views
-from helpers.scenes.completions import MeanFiller, room_cameras
 
 CONFIG = CompletionConfig(steps=2)
 

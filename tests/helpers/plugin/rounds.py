@@ -1,4 +1,4 @@
-"""What test_next_round shares."""
+"""Turns of cameras for tests of one round after the other."""
 
 from __future__ import annotations
 

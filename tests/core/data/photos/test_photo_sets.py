@@ -1,0 +1,77 @@
+"""Photo sets on which cameras by features once failed, from the shared cases, against their true cameras.
+
+Slow ones were last run on 2026-11-28, one after the other outside of pytest.
+"""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from conftest import shared_path
+
+from fb_core.data.photos.collection import read_photos
+from fb_core.evaluation.metrics.pose_metrics import pose_errors
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.pose_solver.verdict import Arrangement
+from fb_core.registration.choice import Registration, register
+
+
+def found_in(case: str) -> tuple[Registration, list[Pinholes]]:
+    """What features find, and the truth (none where the case has none)."""
+    folder = shared_path(f"cases/{case}")
+    photos = read_photos(folder / "input")
+    truth = []
+    if (folder / "truth.json").is_file():
+        told = json.loads((folder / "truth.json").read_text())
+        truth = [camera_of(told[photo.source.name]) for photo in photos]
+    return register(photos, method="features", model=None, seed=0), truth
+
+
+def camera_of(told: dict) -> Pinholes:
+    pose = torch.cat([torch.tensor(told["R"]), torch.tensor(told["c"])[:, None]], dim=1).double()
+    width, height = told["w"], told["h"]
+    return Pinholes(
+        camera_to_world=pose[None],
+        focal=torch.full((1, 2), float(told["f"]), dtype=torch.float64),
+        principal=torch.tensor([[width / 2, height / 2]], dtype=torch.float64),
+        width=width,
+        height=height,
+    )
+
+
+def test_a_turn_on_the_spot_has_rotations_and_no_distances():
+    found, truth = found_in("photos-turn-on-spot-exact")
+    assert found.arrangement == Arrangement.ONE_PLACE and set(found.verdicts) == {"ok"}
+    result = pose_errors(found.cameras, truth)
+    assert result["rotation_degrees"] < 0.1 and result["focal_percent"] < 0.5
+
+
+@pytest.mark.slow
+def test_three_lenses_without_tags():
+    found, truth = found_in("photos-arc-three-lenses")
+    result = pose_errors(found.cameras, truth)
+    assert set(found.verdicts) == {"ok"} and result["rotation_degrees"] < 0.5 and result["center"] < 0.05
+    assert result["focal_percent"] < 1 and any("3 focal lengths" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_a_barrel_lens_is_straightened():
+    found, truth = found_in("photos-arc-barrel")
+    result = pose_errors(found.cameras, truth)
+    assert set(found.verdicts) == {"ok"} and len(found.straight) == 12
+    assert result["rotation_degrees"] < 0.2 and result["center"] < 0.02
+    bent = next(iter(found.straight.values()))
+    assert not bent.stored and any("straightened" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_tags_that_lie_are_not_believed():
+    found, _ = found_in("photos-castle-35mm-wrong")  # 64 mm told, 35 mm true: 492 pixels by the set's own calibration
+    assert set(found.verdicts) == {"ok"} and any("contradicts" in note for note in found.notes)
+
+
+def test_360_degree_photos_are_refused():
+    with pytest.raises(ValueError, match="360-degree picture"):
+        read_photos(shared_path("cases/photos-equirect-360") / "input")
