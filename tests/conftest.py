@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-# Installed before any test imports fb_core, so that every annotated function and dataclass checks its shapes. The parts of
+# Installed before any test imports fb_core: every annotated function and dataclass checks its shapes. The parts of
 # the rasterizer run thousands of times for each picture, so their shapes are tested where they meet, not at each call.
 _CORE = Path(__file__).resolve().parents[1] / "fb_core"
 _CHECKED = sorted(path.stem for path in _CORE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists())

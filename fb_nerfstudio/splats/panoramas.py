@@ -17,7 +17,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from fb_nerfstudio.refusal import Refused
+from fb_core.files.faults import Refused
 
 _FINER = 1.25  # pixels of a face over those of the picture, per radian at the face's middle
 _OVERLAP = 1.02  # half side of a face over that of a cube's, so that its outermost rays have neighbours on both sides

@@ -365,9 +365,7 @@ def _provenance(root: Path) -> dict[str, dict[str, Any]]:
 
 
 def _with_reduced_pictures(capture: Capture) -> Capture:
-    """The capture with the pictures of images_2 (or 4, 8) where the full ones are not there (DL3DV), and cameras of
-    that size.
-    """
+    """The capture with the pictures of images_2 (or 4, 8) where the full ones are missing (DL3DV), cameras alike."""
     if capture.reduced > 1 or any(frame.image_path.is_file() for frame in capture.frames):
         return capture
     for factor, folder in _reduced_folders(capture.root.glob("images_*")):
