@@ -47,6 +47,7 @@ def test_the_pages_have_commands():
     programs = {shlex.split(line)[0] for _, line in ALL}
     assert {
         "make",
+        "git",
         "fillerbuster",
         "ns-train",
         "ns-viewer",
