@@ -115,10 +115,9 @@ def hardware() -> str:
     return f"{name}, {usable_cores()} cores, {torch.get_num_threads()} threads{gpu}, torch {torch.__version__}"
 
 
-def commit() -> str:
-    """Commit of the working tree that this code stands in, or 'unknown' outside of one."""
+def commit(where: Path = Path(__file__).resolve().parent) -> str:
+    """Commit of the working tree that a folder, by default this code's, stands in, or 'unknown' outside of one."""
     try:
-        where = Path(__file__).resolve().parent
         done = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], cwd=where, capture_output=True, text=True, timeout=10
         )

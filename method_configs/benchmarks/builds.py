@@ -84,11 +84,13 @@ class Builds(TableFiles):
 
     def _training_rows(self, this: _Build, other: _Build) -> list[dict[str, Any]]:
         """Both builds' training steps; the loss is a running mean over all of them."""
+        from fb_core.evaluation.results import commit
+
         _logger.info("%d training steps", self.training_steps)
         found = [(this.trained(), other.trained()) for _ in range(self.training_steps)]
         return [
             {
-                "part": "a training step", "build": f"{build.name} ({_commit_of(build.root)})",
+                "part": "a training step", "build": f"{build.name} ({commit(build.root)})",
                 "steps": self.training_steps,
                 "cpu_seconds": median(pair[number]["cpu_seconds"] for pair in found),
                 "seconds": median(pair[number]["seconds"] for pair in found),
@@ -100,12 +102,14 @@ class Builds(TableFiles):
 
     def _row(self, build: _Build, found: dict[str, list[dict[str, float]]], against: str, case: str) -> dict[str, Any]:
         """One build's figures for one case, with its gain over the other one, room by room."""
+        from fb_core.evaluation.results import commit
+
         mine, theirs = found[build.name], found[against]
         psnrs = [one["psnr"] for one in mine]
         gains = [one["psnr"] - other["psnr"] for one, other in zip(mine, theirs, strict=True)]
         times = [other["cpu_seconds"] / one["cpu_seconds"] for one, other in zip(mine, theirs, strict=True)]
         return {
-            "part": f"{case} views", "case": case, "build": f"{build.name} ({_commit_of(build.root)})",
+            "part": f"{case} views", "case": case, "build": f"{build.name} ({commit(build.root)})",
             "steps": build.steps,
             "rooms": len(mine), "cpu_seconds": median(one["cpu_seconds"] for one in mine),
             "seconds": median(one["seconds"] for one in mine), "psnr": mean(psnrs),
@@ -192,19 +196,11 @@ def _standard_error(values: list[float]) -> float:
     return stdev(values) / len(values) ** 0.5 if len(values) > 1 else float("nan")
 
 
-def _commit_of(root: Path) -> str:
-    done = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=False
-    )
-    return done.stdout.strip() if done.returncode == 0 else "unknown"
-
-
 def draw(report: Report, path: Path) -> None:
     """PSNR over CPU seconds, one line a case from the other build to this one."""
-    from matplotlib.figure import Figure
+    from method_configs.benchmarks.command import _axes, _save
 
-    figure = Figure(figsize=(5, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _axes("PSNR of unknown views (dB)")
     for case in dict.fromkeys(row["case"] for row in report.rows if "case" in row):
         rows = [row for row in report.rows if row.get("case") == case]
         axes.plot(
@@ -212,9 +208,6 @@ def draw(report: Report, path: Path) -> None:
         )
         for row in rows:
             axes.annotate(row["build"], (row["cpu_seconds"], row["psnr"]), fontsize=7)
-    axes.set(xscale="log", xlabel="CPU seconds of a whole sampling", ylabel="PSNR of unknown views (dB)")
+    axes.set(xscale="log", xlabel="CPU seconds of a whole sampling")
     axes.legend()
-    from fb_core.files.whole import whole_file
-
-    with whole_file(path) as unfinished:
-        figure.savefig(unfinished, format=path.suffix[1:] or "png")
+    _save(figure, path)
