@@ -271,13 +271,12 @@ def _curve(trial: _Trial, images: Float[Tensor, "n 3 h w"], *, baseline: float) 
 
 def along_rays(depth: Float[Tensor, "n h w"], cameras: Pinholes) -> Float[Tensor, "n 1 h w"]:
     """Distances along the rays of z-depths; what is infinitely far is very far."""
-    cosine = torch.einsum("nhwc,nc->nhw", cameras.directions(), cameras.rotations[:, :, 2])
     finite = torch.where(
         torch.isfinite(depth),
         depth,
         1e4 * depth[torch.isfinite(depth)].max() if bool(torch.isfinite(depth).any()) else 1e4,
     )
-    return (finite / cosine)[:, None]
+    return (finite / cameras.cosines())[:, None]
 
 
 def fitted_camera(view: CapturedView, size: int) -> Pinholes:

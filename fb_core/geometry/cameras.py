@@ -101,6 +101,10 @@ class Pinholes:
         in_world = torch.einsum("nij,nhwj->nhwi", self.rotations, in_camera)
         return F.normalize(in_world, dim=-1)
 
+    def cosines(self) -> Float[Tensor, "n h w"]:
+        """Of the angles between the rays and their camera's axis: z-depth over the distance along the ray."""
+        return torch.einsum("nhwc,nc->nhw", self.directions(), self.rotations[:, :, 2])
+
     def project(self, points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m"]]:
         """Pixel coordinates and z-depth of world points; points with depth <= 0 lie behind (their pixels mean
         nothing).

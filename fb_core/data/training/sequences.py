@@ -250,5 +250,4 @@ class RoomPool(ViewPool):
 
 def _distances(cameras: Pinholes, depth: Float[Tensor, "v h w"]) -> Float[Tensor, "v 1 h w"]:
     """Distances along the rays from z-depth."""
-    along = torch.einsum("vhwc,vc->vhw", cameras.directions(), cameras.rotations[:, :, 2])
-    return (depth / along.to(depth))[:, None]
+    return (depth / cameras.cosines().to(depth))[:, None]
