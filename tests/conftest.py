@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import shutil
+import tempfile
 from pathlib import Path
 
 import jaxtyping
@@ -24,6 +25,11 @@ jaxtyping.install_import_hook(
 torch.set_num_threads(min(2, torch.get_num_threads()))
 settings.register_profile("fillerbuster", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("fillerbuster")
+
+
+# What a user has compiled on this machine takes no part, here and in the processes that tests start: an empty folder.
+_NO_LIBRARIES = tempfile.TemporaryDirectory(prefix="fillerbuster-no-libraries-")
+os.environ["FILLERBUSTER_CACHE"] = _NO_LIBRARIES.name
 
 
 def pytest_configure(config: pytest.Config) -> None:

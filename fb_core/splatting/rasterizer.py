@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.files.limits import MOST_PIXELS
+from fb_core.splatting.compiled.compositing import MOST_CHANNELS, can_composite, composite_compiled
 from fb_core.splatting.projection import ALPHA_MIN, SEMANTICS, Projection, ProjectionSettings, project_splats
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.spherical_harmonics import MAX_DEGREE, sh_colors
@@ -23,6 +25,7 @@ from fb_core.splatting.tiles.cells import CELL_WIDTH, CellGrid, Ellipses, tile_b
 from fb_core.splatting.tiles.compositing import CompositingSettings, composite
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+Engine = Literal["auto", "torch", "compiled"]
 _logger = logging.getLogger(__name__)
 
 
@@ -49,6 +52,7 @@ def rasterization(
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     covars: Float[Tensor, "n 3 3"] | None = None,
     semantics: Literal["1.4", "1.5", "1.6"] = "1.4",
+    engine: Engine = "auto",
 ) -> tuple[Float[Tensor, "c h w x"], Float[Tensor, "c h w 1"], dict[str, Any]]:
     """Images of Gaussians, (colors, alphas, meta), as gsplat 1.4.0 draws them.
 
@@ -73,6 +77,8 @@ def rasterization(
         rasterize_mode: "antialiased" multiplies the opacities by sqrt(det before blur / det after it).
         covars: covariances in place of quats and scales.
         semantics: the version of gsplat to agree with.
+        engine: what lists and composites: torch, the compiled library (see `compiled.library`), or auto: the library
+            where it has been made and fits (at most 15 channels), else torch. They agree within rounding.
 
     Returns:
         colors [c, h, w, x], alphas [c, h, w, 1], and meta for gsplat's strategies (as with packed=False): `means2d` is
@@ -122,11 +128,23 @@ def rasterization(
             projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid
         )
         compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=absgrad)
-        images, alphas = composite(
-            projection.means2d, projection.conics, opacities, values, chosen, ellipses, grid, compositing
+        images, alphas = _compositor(engine, values)(
+            projection.means2d, projection.conics, opacities, values, ellipses, grid, compositing
         )
         images = _finish(images, alphas, backgrounds, render_mode)
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
+
+
+def _compositor(engine: Engine, values: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
+    """What composites such values."""
+    if engine == "torch" or (engine == "auto" and not can_composite(values)):
+        return composite
+    if not can_composite(values):
+        raise ValueError(
+            f"engine: expected torch or auto for {values.shape[1]} channels of {values.dtype} on {values.device}, got "
+            f"compiled, which takes up to {MOST_CHANNELS} channels on the CPU once `fillerbuster compile` has run."
+        )
+    return composite_compiled
 
 
 def _used_colors(colors: Tensor, sh_degree: int | None, render_mode: RenderMode) -> Tensor | None:
@@ -216,6 +234,7 @@ def _ellipses(
             None if tile_size is None else tile_bounds(x, y, columns(projection.radii)[0].to(x.dtype), tile_size, grid)
         )
         return Ellipses(
+            chosen=chosen,
             camera=None if cameras == 1 else torch.div(chosen, number, rounding_mode="floor"),
             x=x,
             y=y,

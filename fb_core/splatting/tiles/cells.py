@@ -61,6 +61,8 @@ class CellGrid:
 class Ellipses:
     """The V Gaussians that can be seen, near ones first, in columns; constants for autograd."""
 
+    chosen: Int32[Tensor, " v"]
+    """Their flat indices, camera * n + Gaussian."""
     camera: Int32[Tensor, " v"] | None
     """Which camera's image; None where there is only one."""
     x: Float[Tensor, " v"]

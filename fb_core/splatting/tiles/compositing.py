@@ -60,19 +60,18 @@ def composite(
     conics: Float[Tensor, "c n 3"],
     opacities: Float[Tensor, "c n"],
     values: Float[Tensor, "v d"],
-    chosen: Int32[Tensor, " v"],
     ellipses: Ellipses,
     grid: CellGrid,
     settings: CompositingSettings,
 ) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
     """Images of the values, and alpha = 1 - transmittance.
 
-    `chosen` holds the flat indices (camera * n + Gaussian) of the Gaussians that may be seen, nearest first; `values`
-    and `ellipses` are given for these rows only. Gradients flow to means2d, conics, opacities and values.
+    `values` and `ellipses` are given only for the Gaussians that may be seen, nearest first. Gradients flow to means2d,
+    conics, opacities and values.
     """
     if not (torch.is_grad_enabled() and any(t.requires_grad for t in (means2d, conics, opacities, values))):
         settings = replace(settings, kept_pairs=0)
-    return _Composite.apply(means2d, conics, opacities, values, chosen, ellipses, grid, settings)
+    return _Composite.apply(means2d, conics, opacities, values, ellipses, grid, settings)
 
 
 def _forward_block(block: Block, image: Tensor) -> None:
@@ -191,7 +190,7 @@ def _plane(cells: Tensor, grid: CellGrid) -> Tensor:
     )
 
 
-def _to_image(cells: Tensor, grid: CellGrid) -> Tensor:
+def to_image(cells: Tensor, grid: CellGrid) -> Tensor:
     """[cells, d, p] -> [c, h, w, d]; channel by channel, which is what keeps a CPU's copies in long runs."""
     height, width, down, across = grid.height, grid.width, grid.cell_height, grid.cell_width
     image = cells.new_empty(grid.cameras, grid.rows * down, grid.columns * across, cells.shape[1])
@@ -202,12 +201,40 @@ def _to_image(cells: Tensor, grid: CellGrid) -> Tensor:
     return image[:, :height, :width].contiguous()
 
 
-def _to_cells(images: list[Tensor], grid: CellGrid) -> Tensor:
+def to_cells(images: list[Tensor], grid: CellGrid) -> Tensor:
     """Images [c, h, w, d] side by side -> [cells, d, p]; pixels beyond the border hold zeros."""
     right, below = grid.columns * grid.cell_width - grid.width, grid.rows * grid.cell_height - grid.height
     planes = torch.cat([image.permute(3, 0, 1, 2) for image in images])
     planes = F.pad(planes, (0, right, 0, below)) if right or below else planes
     return rearrange(planes, "d c (r y) (k x) -> (c r k) d (y x)", y=grid.cell_height, x=grid.cell_width).contiguous()
+
+
+def gradients_of(
+    sums: Float[Tensor, "v r"],
+    means2d: Float[Tensor, "c n 2"],
+    conics: Float[Tensor, "c n 3"],
+    opacities: Float[Tensor, "c n"],
+    ellipses: Ellipses,
+    absgrad: bool,
+) -> tuple[Float[Tensor, "c n 2"], Float[Tensor, "c n 3"], Float[Tensor, "c n"]]:
+    """Gradients of means2d, conics and opacities from the chosen Gaussians' moments and pulls, the first columns of
+    their sums; with `absgrad` also sets `means2d.absgrad`.
+    """
+    m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, :PULLS].t().contiguous().unbind(0)
+    A, B, C = ellipses.A, ellipses.B, ellipses.C
+
+    def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
+        flat = like.new_zeros(means2d.shape[0] * means2d.shape[1], len(columns))
+        return flat.index_copy_(0, ellipses.chosen.long(), torch.stack(columns, dim=1)).view(like.shape)
+
+    if absgrad:
+        # Tensors declare no such attribute; gsplat's strategies read it.
+        setattr(means2d, "absgrad", dense(means2d, [pull_x, pull_y]))  # noqa: B010
+    return (
+        dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)]),
+        dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy]),
+        dense(opacities, [m / ellipses.opacity]),
+    )
 
 
 class _Composite(torch.autograd.Function):
@@ -218,7 +245,6 @@ class _Composite(torch.autograd.Function):
         conics,
         opacities,
         values,
-        chosen,
         ellipses: Ellipses,
         grid: CellGrid,
         settings: CompositingSettings,
@@ -247,8 +273,8 @@ class _Composite(torch.autograd.Function):
                     image.index_add_(0, stretch.cells, local)
                     keep -= stretch.kept
                     walked.append(stretch)
-            colors, alphas = _to_image(image[:, :-1], grid), _to_image(image[:, -1:], grid)
-        ctx.save_for_backward(means2d, conics, opacities, values, chosen)
+            colors, alphas = to_image(image[:, :-1], grid), to_image(image[:, -1:], grid)
+        ctx.save_for_backward(means2d, conics, opacities, values)
         ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
         ctx.table, ctx.scratch, ctx.walked, ctx.starts, ctx.light = table, scratch, walked, starts, light[1]
         return colors, alphas
@@ -256,11 +282,11 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, v_colors, v_alphas):
-        means2d, conics, opacities, values, chosen = ctx.saved_tensors
+        means2d, conics, opacities, values = ctx.saved_tensors
         ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
         with single_thread():
             table, scratch = ctx.table, ctx.scratch
-            upstream = _to_cells([v_colors, v_alphas], grid)
+            upstream = to_cells([v_colors, v_alphas], grid)
             behind, light = upstream.new_zeros(grid.count, upstream.shape[2]), ctx.light.clone()
             channels = values.shape[1]
             sums = values.new_zeros(values.shape[0], padded(PULLS + channels))
@@ -286,16 +312,7 @@ class _Composite(torch.autograd.Function):
                     behind.index_copy_(0, stretch.cells, hidden)
                     light.index_copy_(0, stretch.cells, local)
                 _add_rows(sums, splats, rows)
-            m, mx, my, mxx, mxy, myy, pull_x, pull_y = sums[:, :PULLS].t().contiguous().unbind(0)
-            A, B, C = ellipses.A, ellipses.B, ellipses.C
-
-            def dense(like: Tensor, columns: list[Tensor]) -> Tensor:
-                flat = like.new_zeros(means2d.shape[0] * means2d.shape[1], len(columns))
-                return flat.index_copy_(0, chosen.long(), torch.stack(columns, dim=1)).view(like.shape)
-
-            if settings.absgrad:
-                means2d.absgrad = dense(means2d, [pull_x, pull_y])
-            v_means2d = dense(means2d, [-(A * mx + B * my), -(B * mx + C * my)])
-            v_conics = dense(conics, [-0.5 * mxx, -mxy, -0.5 * myy])
-            v_opacities = dense(opacities, [m / ellipses.opacity])
-        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None, None, None
+            v_means2d, v_conics, v_opacities = gradients_of(
+                sums, means2d, conics, opacities, ellipses, settings.absgrad
+            )
+        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None, None

@@ -22,9 +22,11 @@ import torch
 from torch import Tensor
 
 from fb_core.evaluation.results import Bar, OnCell, Report
+from fb_core.splatting.compiled.library import loaded
 from fb_core.splatting.rasterizer import rasterization
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.tiles import compositing as torch_compositing
+from method_configs.benchmarks.splats.compiled import compiled_rows, draw_compiled
 from method_configs.benchmarks.splats.peers import gsplat_kernels, gsplat_torch, tile_loop
 from method_configs.benchmarks.splats.scenes import LEAVES, SplatScene, capture_scene, room_scene
 
@@ -73,8 +75,8 @@ QUICK = SplatBenchmark(cells=((300, 32),), runs=1, peer_runs=1)
 
 
 def run_splat(config: SplatBenchmark = SplatBenchmark(), *, on_cell: OnCell = lambda _: None) -> Report:
-    """Parts of the report: ours, peers, work (how much there is to do, and the floor), machine (best runs, its speed
-    just then), gpu.
+    """Parts of the report: ours, compiled (where `fillerbuster compile` has run), peers, work (how much there is to do,
+    and the floor), machine (best runs, its speed just then), gpu.
     """
     report = Report(seed=config.seed)
     scenes: list[Callable[[], SplatScene]] = [
@@ -82,7 +84,8 @@ def run_splat(config: SplatBenchmark = SplatBenchmark(), *, on_cell: OnCell = la
     ]
     if config.capture is not None:
         scenes.append(lambda: capture_scene(config.capture, seed=config.seed))  # type: ignore[arg-type]
-    parts: dict[str, list[dict[str, Any]]] = {"ours": [], "peers": [], "work": [], "machine": [], "gpu": []}
+    names = ("ours", "compiled", "peers", "work", "machine", "gpu")
+    parts: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     with single_thread():
         for make in scenes:
             scene = make()
@@ -127,6 +130,9 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
             "both_seconds": slow_both,
             "forward_ratio": slow_forward / forward, "both_ratio": slow_both / both, **values,
         })  # fmt: skip
+    if loaded(torch.float32) is not None:
+        wrong = _errors(_picture_and_gradients(draw_compiled, scene), exact)
+        parts["compiled"].extend({**row, **wrong} for row in compiled_rows(scene, config.runs))
     parts["work"].append(_work(scene, forward))
     if torch.cuda.is_available():
         parts["gpu"].append(_kernels(scene, exact, "cuda", config.runs))
@@ -139,7 +145,7 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
 
 
 def _ours(**inputs: Any) -> tuple[Tensor, Tensor]:
-    return rasterization(**inputs, render_mode="RGB+D")[:2]
+    return rasterization(**inputs, render_mode="RGB+D", engine="torch")[:2]
 
 
 def _loss(images: Tensor, alphas: Tensor) -> Tensor:
@@ -251,7 +257,7 @@ def _work(scene: SplatScene, forward: float) -> dict[str, Any]:
     """Pairs that are evaluated and pairs that are drawn, and the seconds that the latter's exponentials alone take."""
     inputs = scene.inputs()
     with torch.no_grad(), _counting() as pairs:
-        radii = rasterization(**inputs, render_mode="RGB+D")[2]["radii"]
+        radii = rasterization(**inputs, render_mode="RGB+D", engine="torch")[2]["radii"]
     values, out, left = torch.linspace(-6, 0, _IN_CACHE), torch.empty(_IN_CACHE), pairs["drawn"]
     begin = time.process_time()
     while left > 0:
@@ -292,6 +298,10 @@ def _bars(parts: dict[str, list[dict[str, Any]]]) -> list[Bar]:
             bars.append(Bar(name=f"{name} CPU seconds, {scene}", value=row[f"{name}_seconds"], limit=limit, sense="<="))
         if scene in MEGABYTES:
             bars.append(Bar(name=f"peak MB, {scene}", value=row["peak_mb"], limit=MEGABYTES[scene], sense="<="))
+    for row in parts["compiled"]:
+        if row["scene"] == "50k@512" and row["threads"] == 1:
+            told = "compiled, times faster than torch on one thread, 50k@512"
+            bars.append(Bar(name=told, value=row["both_ratio"], limit=2.5, sense=">="))
     for row in parts["peers"]:
         limits = TIMES_FASTER.get(row["scene"], ()) if row["peer"] == "gsplat torch" else ()
         for limit, name in zip(limits, ("forward", "both"), strict=False):

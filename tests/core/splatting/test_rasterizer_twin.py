@@ -21,7 +21,12 @@ GOLDENS = {"basic": (5e-6, 1e-5), "sh3_aa_bg_ed_2cam": (5e-6, 1e-5), "stress_5ch
 @pytest.mark.parametrize("semantics", ["1.4", "1.5", "1.6"])
 @pytest.mark.parametrize("name", GOLDENS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-def test_golden_pictures_and_gradients(shared_path, name: str, semantics: str, dtype: torch.dtype):
+@pytest.mark.parametrize("engine", ["torch", "compiled"])
+def test_golden_pictures_and_gradients(
+    shared_path, request: pytest.FixtureRequest, name: str, semantics: str, dtype: torch.dtype, engine: str
+):
+    if engine == "compiled":
+        request.getfixturevalue("compiled_library")
     golden = torch.load(shared_path(f"golden/splat/{name}.pt"), weights_only=True)
     image_tolerance, gradient_tolerance = GOLDENS[name] if dtype == torch.float32 else (1e-10, 1e-6)
     expected, args = golden["variants"][semantics], golden["args"]
@@ -36,6 +41,7 @@ def test_golden_pictures_and_gradients(shared_path, name: str, semantics: str, d
         rasterize_mode="antialiased" if args["antialiased"] else "classic",
         absgrad=True,
         semantics=semantics,
+        engine=engine,
     )
     meta["means2d"].retain_grad()
     weights = {key: value.to(dtype) for key, value in golden["loss_weights"].items()}

@@ -172,7 +172,7 @@ def test_a_path_s_views_come_first_among_the_candidates() -> None:
 
 
 def test_more_time_never_makes_less_and_what_is_given_is_kept() -> None:
-    speed = Speed(step=3e-6, frame=1.5e-6)
+    speed = Speed(step=2e-6, frame=1.5e-6, whole_step=0.02)
 
     def budget(seconds: float, **given: int) -> SceneBudget:
         return SceneBudget.of(seconds, speed, frames=32, longest=1920, aspect=9 / 16, device="cpu", **given)
@@ -182,6 +182,8 @@ def test_more_time_never_makes_less_and_what_is_given_is_kept() -> None:
         assert less.photo_side <= more.photo_side <= 1920 and less.film_side <= more.film_side <= 1920
     for seconds, one in zip((120, 300, 1200, 10000), several[2:], strict=True):
         assert one.seconds <= seconds
+    small = SceneBudget.of(100, speed, frames=1, longest=32, aspect=1.0, device="cpu")
+    assert small.schedule.steps * speed.whole_step <= small.seconds <= 100  # a step has its price on any picture
     strip = SceneBudget.of(1, speed, frames=1, longest=2000, aspect=0.1, device="cpu")
     assert int(strip.photo_side * 0.1) >= 16  # what is trained on has 16 pixels at least
     given = budget(300, steps=12, photo_side=100, film_side=5000)

@@ -1,0 +1,397 @@
+/* Lists of Gaussians by cell and their compositing, forward and backward: what ../tiles does with torch, in one pass.
+ *
+ * Plain C for gcc or clang, no header of Python or torch; `library.py` compiles it where there is a compiler. Every
+ * function works on a range of cells and writes nothing that belongs to another range, so that any number of threads
+ * gives the same bits. Rules per pixel as in ../tiles/blocks.py: skip alpha < 1/255, cap alpha, stop before the
+ * Gaussian that would bring the transmittance to 1e-4 or below.
+ *
+ * Exponents are to the base 2. A cell has 8 x 4 pixels, or 4 x 4; LANES of them are worked on at once.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifdef DOUBLE
+typedef double real;
+typedef int64_t whole;
+#define BYTES 8
+#else
+typedef float real;
+typedef int32_t whole;
+#define BYTES 4
+#endif
+#define ROUNDED(function, x) ((real)(BYTES == 8 ? function(x) : function##f((float)(x))))
+#define FLOOR(x) ROUNDED(floor, x)
+#define CEIL(x) ROUNDED(ceil, x)
+#define SQRT(x) ROUNDED(sqrt, x)
+#ifdef __AVX512F__
+#define LANES (64 / BYTES)
+#else
+#define LANES (32 / BYTES)
+#endif
+#define MOST_CHANNELS 16 /* values and alpha */
+#define MOST_VECTORS (32 / LANES)
+#define PULLS 8 /* moments and the two absolute pulls: columns of a row of gradients before the values */
+#define GEOMETRY 6 /* columns of a row of the table before the values */
+#define AHEAD 6 /* Gaussians whose rows are on their way to the cache */
+#define STOP ((real)1e-4)
+#define HALF ((real)0.5)
+#define LOG_2 ((real)0.69314718055994531)
+#define ALWAYS static inline __attribute__((always_inline))
+
+typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
+typedef whole ivec __attribute__((vector_size(LANES * sizeof(real))));
+
+ALWAYS vec load(const real *from) { vec v; memcpy(&v, from, sizeof v); return v; }
+ALWAYS void store(real *to, vec v) { memcpy(to, &v, sizeof v); }
+ALWAYS vec splat(real x) { return x - (vec){0}; }
+ALWAYS vec where(ivec yes, vec a) { return (vec)((ivec)a & yes); } /* a or 0 */
+ALWAYS vec choose(ivec yes, vec a, vec b) { return (vec)(((ivec)a & yes) | ((ivec)b & ~yes)); }
+ALWAYS vec absolute(vec a) { return (vec)((ivec)a & ~((whole)1 << (8 * sizeof(real) - 1))); }
+ALWAYS int any(ivec m) { whole e = 0; for (int l = 0; l < LANES; l++) e |= m[l]; return e != 0; }
+
+/* 2^x: the power series on [-1/2, 1/2], and the whole part into the exponent. Below 2^-126 it stays there. */
+ALWAYS vec power_of_2(vec x) {
+#ifdef DOUBLE
+    const real shift = 6755399441055744.0; /* 1.5 * 2^52: adding it rounds to a whole number */
+    static const real series[] = {2.5678435993488206e-11, 4.4455382718708116e-10, 7.0549116208011233e-09,
+        1.0178086009239699e-07, 1.3215486790144309e-06, 1.5252733804059840e-05, 1.5403530393381609e-04,
+        1.3333558146428443e-03, 9.6181291076284771e-03, 5.5504108664821580e-02, 2.4022650695910072e-01,
+        6.9314718055994531e-01, 1.0};
+    const int mantissa = 52;
+#else
+    const real shift = 12582912.0f; /* 1.5 * 2^23 */
+    static const real series[] = {1.54035304e-4f, 1.33335581e-3f, 9.61812911e-3f, 5.55041087e-2f, 2.40226507e-1f,
+        6.93147181e-1f, 1.0f};
+    const int mantissa = 23;
+#endif
+    x = choose(x < -126, splat(-126), x);
+    x = choose(x > 1, splat(1), x); /* rounding noise: alpha is cut anyway */
+    vec rounded = x + shift, f = x - (rounded - shift), p = splat(series[0]);
+    for (unsigned i = 1; i < sizeof series / sizeof *series; i++) p = p * f + series[i];
+    return (vec)((ivec)p + ((ivec)rounded << mantissa));
+}
+
+typedef struct {
+    const real *table;   /* [v, stride]: log2(opacity), x, y, A, B, C (times log2 e), values, 1 */
+    int32_t stride, channels; /* channels: values and the 1 */
+    const int32_t *splats, *starts; /* of cell k: splats[starts[k]] to splats[starts[k + 1] - 1], near ones first */
+    int32_t columns, rows, cell_width, cell_height; /* cells in a row, rows of cells in a picture; pixels */
+    double below, cap; /* alpha at or under `below` is skipped, above `cap` cut */
+} Scene;
+
+/* The exponents' polynomial about the centre of a cell, and u, v of its pixels. */
+typedef struct { vec u[MOST_VECTORS], v[MOST_VECTORS]; int vectors; } Pixels;
+
+ALWAYS Pixels pixels_of(const Scene *s) {
+    Pixels p;
+    p.vectors = s->cell_width * s->cell_height / LANES;
+    for (int i = 0; i < p.vectors; i++)
+        for (int l = 0; l < LANES; l++) {
+            int at = i * LANES + l;
+            p.u[i][l] = at % s->cell_width - (s->cell_width - 1) * HALF;
+            p.v[i][l] = at / s->cell_width - (s->cell_height - 1) * HALF;
+        }
+    return p;
+}
+
+typedef struct { real k0, k1, k2, k3, k4, k5, dx, dy; } Polynomial;
+
+ALWAYS Polynomial polynomial_of(const real *row, real x, real y) {
+    Polynomial k;
+    real dx = row[1] - x, dy = row[2] - y, A = row[3], B = row[4], C = row[5];
+    k.dx = dx, k.dy = dy;
+    k.k1 = A * dx + B * dy, k.k2 = B * dx + C * dy;
+    k.k0 = row[0] - HALF * (dx * k.k1 + dy * k.k2);
+    k.k3 = -HALF * A, k.k4 = -B, k.k5 = -HALF * C;
+    return k;
+}
+
+ALWAYS vec exponent_at(const Polynomial *k, vec u, vec v) {
+    vec along = k->k3 * u + (k->k4 * v + k->k1);
+    return along * u + ((k->k5 * v + k->k2) * v + k->k0);
+}
+
+ALWAYS void centre_of(const Scene *s, int64_t cell, real *x, real *y) {
+    int64_t in_picture = cell % ((int64_t)s->columns * s->rows);
+    *x = (in_picture % s->columns + HALF) * s->cell_width;
+    *y = (in_picture / s->columns + HALF) * s->cell_height;
+}
+
+ALWAYS void forward_cells(
+    const Scene *s, int64_t first, int64_t last, real *image, real *light, whole *stop, const int D, const int N
+) {
+    const Pixels at = pixels_of(s);
+    const int P = N * LANES;
+    const real below = (real)s->below, cap = (real)s->cap;
+    for (int64_t cell = first; cell < last; cell++) {
+        const int32_t *list = s->splats + s->starts[cell];
+        const int32_t count = s->starts[cell + 1] - s->starts[cell];
+        real x, y;
+        centre_of(s, cell, &x, &y);
+        vec sum[MOST_CHANNELS][MOST_VECTORS], T[MOST_VECTORS];
+        ivec live[MOST_VECTORS], end[MOST_VECTORS];
+        for (int i = 0; i < N; i++) {
+            T[i] = load(light + cell * P + i * LANES); /* negative: stopped in an earlier run of Gaussians */
+            live[i] = T[i] > 0;
+            T[i] = absolute(T[i]);
+            end[i] = live[i] & count;
+            for (int d = 0; d < D; d++) sum[d][i] = load(image + (cell * D + d) * P + i * LANES);
+        }
+        ivec stopped = {0};
+        for (int32_t r = 0; r < count; r++) {
+            const real *row = s->table + (int64_t)list[r] * s->stride;
+            if (r + AHEAD < count) __builtin_prefetch(s->table + (int64_t)list[r + AHEAD] * s->stride);
+            const Polynomial k = polynomial_of(row, x, y);
+            ivec stopping = {0};
+            for (int i = 0; i < N; i++) {
+                vec a = power_of_2(exponent_at(&k, at.u[i], at.v[i]));
+                a = where((a > below) & live[i], a);
+                a = choose(a > cap, splat(cap), a);
+                vec w = a * T[i], next = T[i] - w;
+                ivec ends = (next <= STOP) & live[i];
+                end[i] = (ivec)choose(ends, (vec)((ivec){0} + r), (vec)end[i]);
+                live[i] &= ~ends;
+                w = where(live[i], w);
+                T[i] -= w;
+                stopping |= ends;
+                for (int d = 0; d < D; d++) sum[d][i] += row[GEOMETRY + d] * w;
+            }
+            stopped |= stopping;
+            if ((r & 3) == 3 && any(stopped)) { /* a look at every pixel costs as much as a Gaussian */
+                stopped = (ivec){0};
+                ivec left = {0};
+                for (int i = 0; i < N; i++) left |= live[i];
+                if (!any(left)) break;
+            }
+        }
+        for (int i = 0; i < N; i++) {
+            store(light + cell * P + i * LANES, choose(live[i], T[i], -T[i]));
+            memcpy(stop + cell * P + i * LANES, &end[i], sizeof(ivec));
+            for (int d = 0; d < D; d++) store(image + (cell * D + d) * P + i * LANES, sum[d][i]);
+        }
+    }
+}
+
+/* Sums over lanes, as many vectors at once as there are lanes: every fold halves what belongs to one vector and puts
+ * two of them side by side, until lane j holds the sum of vector j.
+ */
+#if LANES == 16
+#define LOW 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23
+#define HIGH 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31
+#elif LANES == 8
+#define LOW 0, 8, 1, 9, 2, 10, 3, 11
+#define HIGH 4, 12, 5, 13, 6, 14, 7, 15
+#else
+#define LOW 0, 4, 1, 5
+#define HIGH 2, 6, 3, 7
+#endif
+#if defined(__clang__) || __GNUC__ >= 12
+#define MIXED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define MIXED(a, b, ...) __builtin_shuffle(a, b, (ivec){__VA_ARGS__})
+#endif
+
+ALWAYS vec fold(vec a, vec b) { return MIXED(a, b, LOW) + MIXED(a, b, HIGH); }
+
+/* What one Gaussian and the pixels of one cell have to do with each other, and the columns of its row of gradients: a
+ * column is worked out where it is folded, so that few of them are held at a time.
+ */
+typedef struct {
+    vec g[MOST_VECTORS], w[MOST_VECTORS], x[MOST_VECTORS], y[MOST_VECTORS]; /* slopes, weights, mean - pixel */
+    real A, B, C;                                                            /* conic */
+    const vec (*upstream)[MOST_VECTORS];
+} Pairs;
+
+ALWAYS vec column(const Pairs *p, const int q, const int absgrad, const int D, const int N) {
+    vec sum = {0};
+#pragma GCC unroll 8
+    for (int i = 0; i < N; i++) {
+        vec g = p->g[i], x = p->x[i], y = p->y[i];
+        switch (q) { /* moments 1, x, y, xx, xy, yy; absolute pulls along x and y; values */
+        case 0: sum += g; break;
+        case 1: sum += g * x; break;
+        case 2: sum += g * y; break;
+        case 3: sum += g * x * x; break;
+        case 4: sum += g * x * y; break;
+        case 5: sum += g * y * y; break;
+        case 6: if (absgrad) sum += absolute(g) * absolute(p->A * x + p->B * y); break;
+        case 7: if (absgrad) sum += absolute(g) * absolute(p->B * x + p->C * y); break;
+        default: if (q - PULLS < D - 1) sum += p->w[i] * p->upstream[q - PULLS][i];
+        }
+    }
+    return sum;
+}
+
+/* Of columns q, q + stride, ...: halves, quarters, ... of LANES columns. */
+#define FOLDED(name, stride, inner) \
+    ALWAYS vec name(const Pairs *p, const int q, const int absgrad, const int D, const int N) { \
+        return fold(inner(p, q, absgrad, D, N), inner(p, q + stride, absgrad, D, N)); \
+    }
+#if LANES == 16
+FOLDED(folded_8, 8, column)
+FOLDED(folded_4, 4, folded_8)
+FOLDED(folded_2, 2, folded_4)
+#elif LANES == 8
+FOLDED(folded_4, 4, column)
+FOLDED(folded_2, 2, folded_4)
+#else
+FOLDED(folded_2, 2, column)
+#endif
+FOLDED(totals, 1, folded_2)
+
+/* Back to front. What each Gaussian of a cell gains goes to its row of the lists, or, where `rows` is NULL (one thread),
+ * straight to the Gaussian's row of `sums_of` (`width` columns, a multiple of LANES): the same additions in the same
+ * order as `fb_add_rows`.
+ */
+ALWAYS void backward_cells(
+    const Scene *s, int64_t first, int64_t last, const real *upstream, real *behind, real *light,
+    const whole *stop, const int absgrad, real *rows, real *sums_of, int32_t width, const int D, const int N
+) {
+    const Pixels at = pixels_of(s);
+    const int P = N * LANES;
+    const real below = (real)s->below, cap = (real)s->cap;
+    for (int64_t cell = first; cell < last; cell++) {
+        const int32_t *list = s->splats + s->starts[cell];
+        const int32_t count = s->starts[cell + 1] - s->starts[cell];
+        real x, y;
+        centre_of(s, cell, &x, &y);
+        vec U[MOST_CHANNELS][MOST_VECTORS], T[MOST_VECTORS], seen_behind[MOST_VECTORS];
+        ivec end[MOST_VECTORS];
+        whole deepest = 0;
+        for (int i = 0; i < N; i++) {
+            T[i] = absolute(load(light + cell * P + i * LANES));
+            seen_behind[i] = load(behind + cell * P + i * LANES);
+            memcpy(&end[i], stop + cell * P + i * LANES, sizeof(ivec));
+            for (int l = 0; l < LANES; l++) deepest = end[i][l] > deepest ? end[i][l] : deepest;
+            for (int d = 0; d < D; d++) U[d][i] = load(upstream + (cell * D + d) * P + i * LANES);
+        }
+        if (rows && deepest < count)
+            memset(rows + (int64_t)(s->starts[cell] + deepest) * width, 0, sizeof(real) * width * (count - deepest));
+        for (int32_t r = deepest - 1; r >= 0; r--) {
+            const real *row = s->table + (int64_t)list[r] * s->stride;
+            real *to = rows ? rows + (int64_t)(s->starts[cell] + r) * width : sums_of + (int64_t)list[r] * width;
+            if (r >= AHEAD) {
+                __builtin_prefetch(s->table + (int64_t)list[r - AHEAD] * s->stride);
+                if (!rows) __builtin_prefetch(sums_of + (int64_t)list[r - AHEAD] * width, 1);
+            }
+            const Polynomial k = polynomial_of(row, x, y);
+            const real A = row[3] * LOG_2, B = row[4] * LOG_2, C = row[5] * LOG_2;
+            Pairs p = {.A = A, .B = B, .C = C, .upstream = (const vec (*)[MOST_VECTORS])U};
+            for (int i = 0; i < N; i++) {
+                vec a = power_of_2(exponent_at(&k, at.u[i], at.v[i]));
+                a = where((a > below) & (r < end[i]), a);
+                ivec capped = a > cap;
+                a = choose(capped, splat(cap), a);
+                vec shown = U[D - 1][i]; /* of alpha, whose value is 1 */
+                for (int d = 0; d < D - 1; d++) shown += row[GEOMETRY + d] * U[d][i];
+                vec difference = shown - seen_behind[i];
+                T[i] = T[i] / (1 - a); /* in front of this Gaussian */
+                vec w = a * T[i];
+                seen_behind[i] += a * difference;
+                p.w[i] = w, p.g[i] = where(~capped, w * difference);
+                p.x[i] = k.dx - at.u[i], p.y[i] = k.dy - at.v[i];
+            }
+#pragma GCC unroll 8
+            for (int q = 0; q < PULLS + D - 1; q += LANES) {
+                vec told = totals(&p, q, absgrad, D, N);
+                store(to + q, rows ? told : load(to + q) + told);
+            }
+        }
+        for (int i = 0; i < N; i++) {
+            store(light + cell * P + i * LANES, T[i]);
+            store(behind + cell * P + i * LANES, seen_behind[i]);
+        }
+    }
+}
+
+/* Which cells each Gaussian of a run touches, strip by strip: cell[i], the first one of strip i, and wide[i], how many.
+ * Counts of the cells that are alive go to counts[cell + 1]. Returns the number of strips. The same ellipse as
+ * `list_cells` in ../tiles/cells.py, whose columns these are.
+ */
+typedef struct {
+    const real *x, *y, *skew, *over_A, *over_yy, *reach, *turn, *first_row;
+    const int32_t *rows, *camera; /* camera: NULL where there is one only */
+    const real *left, *right;    /* cells that the square box allows, or NULL */
+    int32_t columns, grid_rows, cell_width, cell_height;
+} Strips;
+
+ALWAYS real clamp(real x, real low, real high) { return x > low ? (x < high ? x : high) : low; } /* NaN: low */
+
+ALWAYS real edge(const Strips *s, int64_t g, real turning, real low, real high, real side) {
+    real y = clamp(turning, low, high);
+    real inside = s->reach[g] - y * y * s->over_yy[g];
+    return s->skew[g] * y + s->x[g] + side * (SQRT((inside < 0 ? 0 : inside) * s->over_A[g]) + (real)0.01);
+}
+
+int64_t fb_strips(
+    const Strips *s, int64_t begin, int64_t end, const uint8_t *alive, int32_t *cell, int32_t *wide, int32_t *counts
+) {
+    int64_t strips = 0;
+    const real width = s->cell_width, height = s->cell_height, columns = s->columns;
+    for (int64_t g = begin; g < end; g++) {
+        int32_t first = (int32_t)s->first_row[g], picture = s->camera ? s->camera[g] * s->grid_rows : 0;
+        real least = s->left ? s->left[g] : 0, most = s->right ? s->right[g] : columns;
+        for (int32_t row = first; row < first + s->rows[g]; row++, strips++) {
+            real low = row * height + HALF - s->y[g], high = low + (height - 1);
+            real from = FLOOR(CEIL(edge(s, g, -s->turn[g], low, high, -1) - HALF) / width);
+            real to = FLOOR(FLOOR(edge(s, g, s->turn[g], low, high, 1) - HALF) / width) + 1;
+            from = clamp(from, least > 0 ? least : 0, columns), to = clamp(to, 0, most < columns ? most : columns);
+            cell[strips] = (picture + row) * s->columns + (int32_t)from;
+            wide[strips] = to > from ? (int32_t)(to - from) : 0;
+            for (int32_t c = cell[strips]; c < cell[strips] + wide[strips]; c++) counts[c + 1] += alive ? alive[c] : 1;
+        }
+    }
+    return strips;
+}
+
+/* The lists: `next` holds where each cell's list begins, and is moved on to where it ends. */
+void fb_fill(
+    const Strips *s, int64_t begin, int64_t end, const uint8_t *alive, const int32_t *cell, const int32_t *wide,
+    int32_t *next, int32_t *splats
+) {
+    int64_t strip = 0;
+    for (int64_t g = begin; g < end; g++)
+        for (int32_t row = 0; row < s->rows[g]; row++, strip++)
+            for (int32_t c = cell[strip]; c < cell[strip] + wide[strip]; c++)
+                if (!alive || alive[c]) splats[next[c]++] = (int32_t)g;
+}
+
+/* One copy for each number of channels that is common, with loops unrolled. */
+#define FOR_CHANNELS(CALL) \
+    switch (s->channels) { \
+    case 2: CALL(2); break; \
+    case 4: CALL(4); break; \
+    case 5: CALL(5); break; \
+    case 7: CALL(7); break; \
+    case 8: CALL(8); break; \
+    default: CALL(s->channels); \
+    }
+
+void fb_forward(const Scene *s, int64_t first, int64_t last, real *image, real *light, whole *stop) {
+#define FORWARD(D) \
+    if (s->cell_width == 8) forward_cells(s, first, last, image, light, stop, D, 32 / LANES); \
+    else forward_cells(s, first, last, image, light, stop, D, 16 / LANES)
+    FOR_CHANNELS(FORWARD)
+}
+
+void fb_backward(
+    const Scene *s, int64_t first, int64_t last, const real *upstream, real *behind, real *light,
+    const whole *stop, int32_t absgrad, real *rows, real *sums_of, int32_t width
+) {
+#define RANGE s, first, last, upstream, behind, light, stop
+#define BACKWARD(D) \
+    if (s->cell_width != 8) backward_cells(RANGE, absgrad, rows, sums_of, width, D, 16 / LANES); \
+    else if (absgrad) backward_cells(RANGE, 1, rows, sums_of, width, D, 32 / LANES); \
+    else backward_cells(RANGE, 0, rows, sums_of, width, D, 32 / LANES)
+    FOR_CHANNELS(BACKWARD)
+}
+
+/* sums[splats[i]] += rows[i], in the order of the rows. */
+void fb_add_rows(int64_t count, const int32_t *splats, const real *rows, int32_t width, real *sums) {
+    for (int64_t i = 0; i < count; i++) {
+        real *to = sums + (int64_t)splats[i] * width;
+        const real *from = rows + i * width;
+        for (int32_t c = 0; c < width; c++) to[c] += from[c];
+    }
+}

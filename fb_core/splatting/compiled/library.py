@@ -1,0 +1,111 @@
+"""The compiled lists and compositing of `compositing.c`: made once by `fillerbuster compile`, then found and loaded.
+
+Nothing is compiled unasked. The library lies in the user's own cache folder, under a name that says from what it was
+made (source, options, processor), so that another version of this package or another processor never loads it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from fb_core.files.whole import whole_file
+
+SOURCE = Path(__file__).with_name("compositing.c")
+CACHE_VARIABLE = "FILLERBUSTER_CACHE"
+"""Environment variable: folder of compiled libraries, instead of the system's usual place."""
+_OPTIONS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+_DEFINES = {torch.float32: (), torch.float64: ("-DDOUBLE",)}
+_COMPILERS = ("cc", "gcc", "clang")
+
+
+class NoCompiler(ValueError):
+    """In one sentence why nothing could be compiled."""
+
+
+def library_path(dtype: torch.dtype) -> Path:
+    """Where the library for tensors of this dtype lies, or would lie once it is made."""
+    made_from = (SOURCE.read_bytes(), " ".join((*_OPTIONS, *_DEFINES[dtype])).encode(), _processor().encode())
+    return cache_folder() / f"compositing-{hashlib.sha256(b'|'.join(made_from)).hexdigest()[:16]}.so"
+
+
+def cache_folder() -> Path:
+    """The folder that compiled libraries are kept in."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named:
+        return Path(named).expanduser().resolve()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fillerbuster"
+
+
+def compile_libraries(compiler: str | None = None) -> list[Path]:
+    """Compile for single and double precision, which takes some seconds each; what is there already is made anew.
+
+    Raises NoCompiler where there is no compiler or it fails, and CannotWrite where the folder cannot be written.
+    """
+    program = compiler or os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
+    if program is None or shutil.which(program) is None:
+        raise NoCompiler(
+            f"compile: expected a C compiler, one of {', '.join(_COMPILERS)} or the one that CC names, found "
+            f"{'none' if program is None else f'no program {program}'}: install gcc or clang, or go on without (splats "
+            "are then drawn by torch alone)."
+        )
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    made = []
+    for dtype, defines in _DEFINES.items():
+        with whole_file(library_path(dtype)) as unfinished:
+            command = [program, *_OPTIONS, *defines, str(SOURCE), "-o", str(unfinished), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                reason = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+                raise NoCompiler(
+                    f"compile: {program} ended with code {done.returncode} ({reason}): name another compiler by CC, "
+                    "or go on without (splats are then drawn by torch alone)."
+                )
+            unfinished.chmod(0o700)
+        made.append(library_path(dtype))
+    loaded.cache_clear()
+    return made
+
+
+@cache
+def loaded(dtype: torch.dtype) -> ctypes.CDLL | None:
+    """The library for tensors of this dtype; None where it has not been made, or where others may write to it."""
+    if dtype not in _DEFINES:
+        return None
+    path = library_path(dtype)
+    if not path.is_file() or not (_private(path.parent) and _private(path)):
+        return None
+    library = ctypes.CDLL(str(path))
+    library.fb_strips.restype = ctypes.c_int64
+    for name in ("fb_fill", "fb_forward", "fb_backward", "fb_add_rows"):
+        getattr(library, name).restype = None
+    return library
+
+
+def _private(path: Path) -> bool:
+    """Whether nobody but this user can write there: a library is code."""
+    if not hasattr(os, "getuid"):
+        return True  # systems without owners by number: the folder is the user's own
+    told = path.stat()
+    return told.st_uid in (os.getuid(), 0) and not told.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+@cache
+def _processor() -> str:
+    """What decides which instructions there are."""
+    told = Path("/proc/cpuinfo")
+    lines = told.read_text(encoding="utf-8").splitlines() if told.is_file() else []
+    kept = {
+        line for line in lines if line.partition("\t")[0].strip() in ("model name", "flags", "Features", "CPU part")
+    }
+    return "|".join([platform.system(), platform.machine(), platform.processor(), *sorted(kept)])

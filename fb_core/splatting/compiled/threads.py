@@ -1,0 +1,83 @@
+"""Ranges of cells on as many threads as are worth it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from itertools import pairwise
+
+import torch
+from jaxtyping import Int32
+from torch import Tensor
+
+from fb_core.machine.resources import usable_cores
+
+_ROWS_PER_THREAD = 20_000  # (Gaussian, cell): below these another thread costs more than it saves
+_PARTS_PER_THREAD = 4  # some take longer than others
+_LOOKS_EVERY_SECONDS = 5.0
+_looked: tuple[float, int] = (-1e9, 1)
+_fixed: ContextVar[int | None] = ContextVar("fixed_threads", default=None)
+
+
+def threads_for(rows: int) -> int:
+    """How many threads for so many rows (Gaussian, cell): as many as have enough to do and find a free core, or as
+    `fixed_threads` says.
+    """
+    fixed = _fixed.get()
+    if fixed is not None:
+        return fixed
+    return 1 if rows < 2 * _ROWS_PER_THREAD else min(free_cores(), rows // _ROWS_PER_THREAD)
+
+
+@contextmanager
+def fixed_threads(number: int) -> Iterator[None]:
+    """Inside the block so many threads, whatever there is to do, for measuring and for tests.
+
+    Raises ValueError for a number below 1.
+    """
+    if number < 1:
+        raise ValueError(f"number: expected 1 thread or more, got {number}")
+    token = _fixed.set(number)
+    try:
+        yield
+    finally:
+        _fixed.reset(token)
+
+
+def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"], threads: int) -> None:
+    """``work(first, last)`` for ranges of cells that together are all of them.
+
+    Args:
+        work: what is done with the cells from `first` to `last` (excluded); ranges must not disturb each other.
+        starts: where the list of each cell begins, and how many rows there are in all, by which ranges are cut.
+        threads: how many at once.
+    """
+    cells, rows = starts.shape[0] - 1, int(starts[-1])
+    if threads <= 1 or cells < 2:
+        work(0, cells)
+        return
+    parts = min(threads * _PARTS_PER_THREAD, cells)
+    cuts = torch.searchsorted(starts, torch.arange(1, parts, dtype=torch.int32) * (rows // parts)).tolist()
+    edges = [0, *cuts, cells]
+    ranges = [(first, last) for first, last in pairwise(edges) if last > first]
+    list(_pool(os.getpid(), threads).map(lambda part: work(*part), ranges))
+
+
+def free_cores() -> int:
+    """Cores that this process may use and that nothing else is busy on, 1 at least; looked at every few seconds."""
+    global _looked
+    now = time.monotonic()
+    if now - _looked[0] > _LOOKS_EVERY_SECONDS:
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
+        _looked = now, max(1, usable_cores() - max(0, round(load - 1)))  # this process is 1 of the load
+    return _looked[1]
+
+
+@cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # of each process: threads do not outlive a fork
+    return ThreadPoolExecutor(max_workers=threads, thread_name_prefix=f"splats-{process}")
