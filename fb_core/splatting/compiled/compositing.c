@@ -240,9 +240,9 @@ FOLDED(folded_2, 2, column)
 #endif
 FOLDED(totals, 1, folded_2)
 
-/* Back to front. What each Gaussian of a cell gains goes to its row of the lists, or, where `rows` is NULL (one thread),
- * straight to the Gaussian's row of `sums_of` (`width` columns, a multiple of LANES): the same additions in the same
- * order as `fb_add_rows`.
+/* Back to front. What each Gaussian of a cell gains goes to its row of the lists, or, where `rows` is NULL (one
+ * thread), straight to the Gaussian's row of `sums_of` (`width` columns, a multiple of LANES): the same additions in the
+ * same order as `fb_add_rows`.
  */
 ALWAYS void backward_cells(
     const Scene *s, int64_t first, int64_t last, const real *upstream, real *behind, real *light,
