@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -115,6 +116,8 @@ class FillerbusterTrainer(Trainer):
     """
 
     config: FillerbusterTrainerConfig
+    when_stopped: Callable[[int], NoReturn] | None = None
+    """Called with the signal's number once a stopped training is saved; None: say how to go on, and end the process."""
     _in_step, _asked = False, 0
     _unsaved: int | None = None
 
@@ -157,12 +160,17 @@ class FillerbusterTrainer(Trainer):
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, signal.SIG_DFL)
                 self._keep_what_is_trained()
-                self.config._stop(asked.number)
+                self._stop(asked.number)
+
+    def _stop(self, number: int) -> NoReturn:
+        if self.when_stopped is not None:
+            self.when_stopped(number)
+        self.config._stop(number)
 
     def _asked_to_stop(self, number: int) -> None:
         """Called in the main thread when a signal comes. A second one ends the training at once, whatever it does."""
         if self._asked:
-            self.config._stop(number)
+            self._stop(number)
         if self._in_step and self._unsaved is not None and not getattr(self.pipeline.datamanager, "at_work", False):
             self._asked = number  # the step's tensors do not belong together before its end
         else:

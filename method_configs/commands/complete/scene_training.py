@@ -17,6 +17,7 @@ import torch
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import CompletedViews
+from fb_core.machine.interruption import raise_interrupt, signals_given_back
 from fb_nerfstudio.runs.finished_run import quiet
 from fb_nerfstudio.splats.splat_file import Splats
 from method_configs.splats import fillerbuster
@@ -89,8 +90,9 @@ def train_scene(
     config.refuse_bad_input()
     _forget_writers()
     torch.manual_seed(seed)
-    with quiet():
+    with quiet(), signals_given_back():
         trainer = config.setup(local_rank=0, world_size=1)
+        trainer.when_stopped = raise_interrupt  # this command says how to go on
         trainer.setup()
         left = schedule.steps - trainer._start_step
         manager, model = trainer.pipeline.datamanager, trainer.pipeline.model

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fb_core.machine.interruption import stop_on_signals
+from fb_core.machine.interruption import signals_given_back, stop_on_signals
 from fb_core.training.run.signals import StopSignal
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -133,3 +133,15 @@ def test_nerfstudio_ends_with_a_code_and_says_where_to_go_on(tmp_path: Path, cap
         "given": f"go on with --load-dir {given}",
     }[saved]
     assert capsys.readouterr().err == f"\nStopped; {advice}.\n"
+
+
+def test_signals_go_back_to_whom_they_went_before() -> None:
+    """A training inside another command takes Ctrl-C for itself only as long as it lasts."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    hook = sys.unraisablehook
+    with pytest.raises(ValueError, match="inside"), signals_given_back():
+        stop_on_signals(lambda number: None)
+        assert all(signal.getsignal(number) != handler for number, handler in before.items())
+        raise ValueError("inside")
+    assert all(signal.getsignal(number) == handler for number, handler in before.items())
+    assert sys.unraisablehook is hook
