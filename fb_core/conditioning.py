@@ -7,6 +7,7 @@ raymap, [64] image mask, [65] ray mask. Its 32 outputs are the image velocity [0
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -79,6 +80,20 @@ def stacked_facts(parts: Sequence[Conditioning], config: DiTConfig) -> TokenFact
     return Conditioning(channels=channels, frames=frames).facts(config)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Encoding:
+    """How the autoencoders encode."""
+
+    views_at_once: int = 16
+    """Views encoded together, which bounds memory."""
+    generators: Sequence[torch.Generator] | None = None
+    """One for each view, on the CPU, to sample the posteriors; without, their means are taken."""
+    precision: torch.dtype = torch.float32
+    """Of the image autoencoder where it does not sample (:func:`encode_frozen`); rays are always in float32, for
+    rounding would move cameras.
+    """
+
+
 def only_known(values: Float[Tensor, "n c h w"], known: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n c h w"]:
     """``values`` where known (scaled by a fractional mask), 0 elsewhere. Chosen, not multiplied: NaN in unknown pixels
     does not survive.
@@ -123,25 +138,25 @@ def encode_known(
     *,
     image_vae: VAE,
     raymap_vae: VAE,
-    views_at_once: int = 16,
-    generators: Sequence[torch.Generator] | None = None,
     transformer: DiTConfig | None = None,
     guess: tuple[Float[Tensor, "n 3 hp wp"], Float[Tensor, "n 1 hp wp"]] | None = None,
-    precision: torch.dtype = torch.float32,
+    encoding: Encoding = Encoding(),
 ) -> Conditioning:
-    """Encode the known pixels and rays of n views (both in [0, 1]; unknown ones become 0, which the VAEs see as -1).
+    """What the network is told of n views, the part of Eq. 1 that does not change with the time:
 
-    With a generator for each view (on the CPU) the posteriors are sampled, otherwise their means are taken. For a
-    ``transformer`` that attends in ray frames these are reckoned too. A ``guess`` (images, belief) is told where no
-    pixel is known (:func:`with_guess`). Images are encoded in ``precision`` (:func:`encode_frozen`) unless they are
-    sampled; rays never are, for rounding would move cameras.
+        E_I(m_I * I) ++ E_R(m_R * R) ++ m_I ++ m_R
+
+    with the autoencoders E_I and E_R and the masks m, which follow on the latent grid. Pixels and rays are in [0, 1];
+    unknown ones become 0, which the autoencoders see as -1. For a ``transformer`` that attends in ray frames these are
+    reckoned too. A ``guess`` (images, belief) is told where no pixel is known (:func:`with_guess`).
     """
     told = only_known(images, image_known)
     if guess is not None:
         told, image_known = with_guess(told, image_known, *guess)
-    image_latents = _encoded_once(image_vae, told, image_known, views_at_once, generators, precision)
+    image_latents = _encoded_once(image_vae, told, image_known, encoding)
     del told
-    ray_latents = _encoded_once(raymap_vae, only_known(raymaps01, rays_known), rays_known, views_at_once, generators)
+    exact = dataclasses.replace(encoding, precision=torch.float32)
+    ray_latents = _encoded_once(raymap_vae, only_known(raymaps01, rays_known), rays_known, exact)
     frames = frames_for(transformer, 2 * raymaps01 - 1, rays_known)
     return assemble(image_latents, ray_latents, to_latent_grid(image_known), to_latent_grid(rays_known), frames)
 
@@ -176,21 +191,20 @@ def _encoded_once(
     vae: VAE,
     told: Float[Tensor, "n c h w"],
     known: Float[Tensor, "n 1 h w"],
-    views_at_once: int,
-    generators: Sequence[torch.Generator] | None,
-    precision: torch.dtype = torch.float32,
+    encoding: Encoding,
 ) -> Float[Tensor, "n 16 lh lw"]:
     """Latents of what is told; views of which nothing is known, which are all alike, are encoded as one (but for
     samples, which differ).
     """
-    if generators is not None:
-        return encode_in_chunks(vae, told, views_at_once, generators)
+    at_once, precision = encoding.views_at_once, encoding.precision
+    if encoding.generators is not None:
+        return encode_in_chunks(vae, told, at_once, encoding.generators)
     something = (known > 0).flatten(1).any(dim=1)
     if int((~something).sum()) < 2:
-        return encode_frozen(vae, told, views_at_once, precision)
+        return encode_frozen(vae, told, at_once, precision)
     first = int((~something).nonzero()[0, 0])
     chosen = torch.cat([something.nonzero()[:, 0], something.new_tensor([first], dtype=torch.long)])
-    latents = encode_frozen(vae, told[chosen], views_at_once, precision)
+    latents = encode_frozen(vae, told[chosen], at_once, precision)
     place = torch.where(something, something.cumsum(0) - 1, len(chosen) - 1)
     return latents[place]
 
@@ -237,7 +251,13 @@ def decode_in_chunks(
 
 
 def join(state: Float[Tensor, "*b 32 h w"], conditioning: Conditioning) -> Float[Tensor, "*b 66 h w"]:
-    """The sequence s_t of Eq. 1 in channel order."""
+    """The sequence of Eq. 1 at time t, along the channels:
+
+        s_t = z_t^I ++ z_t^R ++ E_I(m_I * I) ++ E_R(m_R * R) ++ m_I ++ m_R
+
+    ``state`` is z_t^I ++ z_t^R, the noisy latents of images and raymaps; the rest is the conditioning
+    (:func:`encode_known`).
+    """
     return torch.cat([state, conditioning.channels.to(state.dtype)], dim=-3)
 
 

@@ -8,17 +8,18 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from fb_core import checkpoint
 from fb_core.conditioning import (
     LATENT_CHANNELS,
+    Encoding,
     decode_in_chunks,
     encode_in_chunks,
     encode_known,
@@ -29,25 +30,19 @@ from fb_core.conditioning import (
 )
 from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
+from fb_core.given_views import as_given, check_current, check_views, padded, working
 from fb_core.machine.precision import resolved
-from fb_core.masks import to_latent_grid
-from fb_core.memory.budget import SIDE_MULTIPLE, Cut, MemoryEstimate, available_bytes, estimate, uncut
+from fb_core.memory.budget import Cut, MemoryEstimate, available_bytes, estimate, uncut
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
 from fb_core.sampling.integration.trajectory import OnStep, SamplingInterrupted
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.preview import Progress
 from fb_core.sampling.randomness import noise_of, posterior_generators, random_orders
-from fb_core.sampling.starts import known_latents
+from fb_core.sampling.starts import joining
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
-_LATENT_PIXELS = 8  # side of what one latent stands for
-_STARTS = 4  # steps in which a mask between 0 and 1 says when a latent joins the sampling
-_FARTHEST = {
-    "pixels": 1e4,
-    "rays": 1e12,
-}  # known values beyond are no colours or places, and their squares would overflow
 _logger = logging.getLogger(__name__)
 
 
@@ -68,6 +63,38 @@ def _in_own_precision(
             return method(self, *args, **kwargs)
 
     return called
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """Views to be completed, as the networks take them."""
+
+    views: Views
+    """Padded, in float32 (raymaps perhaps more exact), on the model's device."""
+    frame: CanonicalFrame | None
+    """Of the known rays, None where none are."""
+    cut: Cut
+    """How the work is cut to fit the memory."""
+    sampling: SamplingConfig
+    """As it was asked for."""
+
+    def canonical(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+        """Raymaps of the world in the canonical frame."""
+        return raymaps if self.frame is None else self.frame.apply(raymaps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Start:
+    """Where denoising starts."""
+
+    sampling: SamplingConfig
+    """With the strength that follows: 1 where nothing is started from."""
+    latents: Float[Tensor, "n 32 h w"] | None = None
+    """Of what is started from."""
+    joined: Float[Tensor, "n 32 h w"] | None = None
+    """Which of these count, and from when on (`fb_core.sampling.starts.joining`)."""
+    guess: Views | None = None
+    """What is told as a guess."""
 
 
 class Fillerbuster:
@@ -184,29 +211,15 @@ class Fillerbuster:
                 finite or far out of range, a prompt that the model cannot read, or too little memory however the work
                 is cut (saying what would fit).
         """
-        _check(views)
-        sampling = self.recommended_sampling if sampling is None else sampling
+        check_views(views)
         if current is not None:
-            _check_current(current, views)
+            check_current(current, views)
+        sampling = self.recommended_sampling if sampling is None else sampling
         text = self._text_of(prompt if sampling.guidance_text else None)
-        cut = self._cut(len(views), views.size, sampling, prompt)
+        job = self._job(views, sampling, prompt)
         seed = None if resume is None else resume.seed
         seed = int(torch.randint(0, 2**62, (), generator=generator)) if seed is None else seed
-        ready = _working(views, self.device)
-        frame, padded = frame_of_known_rays(ready.raymaps, ready.rays_known), _padded(ready)
-        started = counts = guess = None
-        if current is not None:
-            current = _padded(_working(current, self.device), mode="replicate")
-            guess = current if sampling.guess != "start" else None
-            if sampling.guess == "told":
-                sampling = dataclasses.replace(sampling, strength=1.0)
-        if current is not None and sampling.strength < 1:
-            counts = _counting(current, padded)
-            if counts is None:  # they tell nothing that is not known anyway
-                sampling = dataclasses.replace(sampling, strength=1.0)
-            else:
-                started = self._encoded(current, padded, frame, cut)
-        denoising = self._denoising(padded, frame, started, counts, text, seed, sampling, cut, guess)
+        denoising = self._denoising(job, self._start(job, current), text, seed)
         look = (
             None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
         )
@@ -218,7 +231,7 @@ class Fillerbuster:
             stopped.seed = seed
             raise
         del denoising
-        return _as_given(self._decode(padded, latents, frame, cut), views)
+        return as_given(self._decode(job, latents), views)
 
     def recover_raymaps(
         self, images: Float[Tensor, "n 3 h w"], *, generator: torch.Generator, sampling: SamplingConfig | None = None
@@ -270,43 +283,53 @@ class Fillerbuster:
     @_in_own_precision
     def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig | None = None) -> Denoising:
         """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
-        _check(views)
+        check_views(views)
         sampling = self.recommended_sampling if sampling is None else sampling
-        ready = _working(views, self.device)
-        frame, padded = frame_of_known_rays(ready.raymaps, ready.rays_known), _padded(ready)
-        cut = self._cut(len(views), views.size, sampling, None)
-        return self._denoising(padded, frame, None, None, self._text_of(None), seed, sampling, cut)
+        job = self._job(views, sampling, None)
+        return self._denoising(job, _Start(sampling=sampling), self._text_of(None), seed)
 
-    def _denoising(
-        self,
-        views: Views,
-        frame: CanonicalFrame | None,
-        current: Tensor | None,
-        counts: Tensor | None,
-        text: Tensor | None,
-        seed: int,
-        sampling: SamplingConfig,
-        cut: Cut,
-        guess: Views | None = None,
-    ) -> Denoising:
-        """What is known of the padded views, encoded, with all draws."""
-        canonical = torch.where(views.rays_known > 0, views.raymaps, 0.0)
-        if frame is not None:
-            canonical = frame.apply(canonical)
+    def _job(self, views: Views, sampling: SamplingConfig, prompt: str | None) -> _Job:
+        """The views as the networks take them, their frame, and how the work is cut."""
+        cut = self._cut(len(views), views.size, sampling, prompt)
+        ready = working(views, self.device)
+        frame = frame_of_known_rays(ready.raymaps, ready.rays_known)
+        return _Job(views=padded(ready), frame=frame, cut=cut, sampling=sampling)
+
+    def _start(self, job: _Job, current: Views | None) -> _Start:
+        """What denoising starts from and is told as a guess, of views that there are already."""
+        sampling = job.sampling
+        if current is None:
+            return _Start(sampling=sampling)
+        current = padded(working(current, self.device), mode="replicate")
+        guess = current if sampling.guess != "start" else None
+        if sampling.guess == "told":
+            sampling = dataclasses.replace(sampling, strength=1.0)
+        if sampling.strength < 1:
+            joined = joining(current, job.views)
+            if joined is not None:
+                latents = self._encoded(current, job)
+                return _Start(sampling=sampling, latents=latents, joined=joined, guess=guess)
+            sampling = dataclasses.replace(sampling, strength=1.0)  # they tell nothing that is not known anyway
+        return _Start(sampling=sampling, guess=guess)
+
+    def _denoising(self, job: _Job, start: _Start, text: Tensor | None, seed: int) -> Denoising:
+        """What is known of the views, encoded, with all draws."""
+        views, guess, sampling = job.views, start.guess, start.sampling
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
         conditioning = encode_known(
             views.images,
             views.image_known,
-            to_unit_range(canonical).float(),
+            to_unit_range(job.canonical(torch.where(views.rays_known > 0, views.raymaps, 0.0))).float(),
             views.rays_known,
             **vaes,
-            views_at_once=cut.views_encoded,
-            generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
+            encoding=Encoding(
+                views_at_once=job.cut.views_encoded,
+                generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
+                precision=resolved(sampling.precision, self.device),
+            ),
             transformer=self.dit.config,
             guess=None if guess is None else (guess.images, sampling.belief * guess.image_known),
-            precision=resolved(sampling.precision, self.device),
         )
-        del canonical
         height, width = conditioning.channels.shape[-2:]
         return Denoising(
             dit=self.dit,
@@ -316,37 +339,33 @@ class Fillerbuster:
             orders=random_orders(seed),
             sampling=sampling,
             text=text,
-            current=current,
-            counts=counts,
-            branches_at_once=cut.branches,
+            current=start.latents,
+            counts=start.joined,
+            branches_at_once=job.cut.branches,
         )
 
-    def _encoded(
-        self, current: Views, views: Views, frame: CanonicalFrame | None, cut: Cut
-    ) -> Float[Tensor, "n 32 h w"]:
+    def _encoded(self, current: Views, job: _Job) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
-        whole = (current.image_known > 0).to(
-            current.image_known
-        )  # a mask below 1 says when a pixel joins, not how dark it is
+        views, at_once = job.views, job.cut.views_encoded
+        # A mask below 1 says when a pixel joins, not how dark it is.
+        whole = (current.image_known > 0).to(current.image_known)
         images = only_known(views.images, views.image_known) + (1 - views.image_known) * only_known(
             current.images, whole
         )
         raymaps = torch.where(views.rays_known > 0, views.raymaps, current.raymaps.to(views.raymaps))
         there = views.rays_known.maximum(current.rays_known) > 0
-        raymaps = torch.where(there, raymaps, 0.0)
-        raymaps01 = to_unit_range(raymaps if frame is None else frame.apply(raymaps)).clamp(0, 1).float()
-        raymaps01 = torch.where(
-            there, raymaps01, 0.0
-        )  # as in what is known; 0 of the world would be a place that depends on the world
+        raymaps01 = to_unit_range(job.canonical(torch.where(there, raymaps, 0.0))).clamp(0, 1).float()
+        # As in what is known; 0 of the world would be a place that depends on the world.
+        raymaps01 = torch.where(there, raymaps01, 0.0)
         return unsplit(
-            encode_in_chunks(self.image_vae, images, cut.views_encoded),
-            encode_in_chunks(self.raymap_vae, raymaps01, cut.views_encoded),
+            encode_in_chunks(self.image_vae, images, at_once), encode_in_chunks(self.raymap_vae, raymaps01, at_once)
         )
 
-    def _decode(self, views: Views, latents: Tensor, frame: CanonicalFrame | None, cut: Cut) -> Views:
+    def _decode(self, job: _Job, latents: Tensor) -> Views:
         """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not
         decoded.
         """
+        views, frame, cut = job.views, job.frame, job.cut
         image_latents, ray_latents = split(latents)
         images = only_known(views.images, views.image_known)
         todo = (views.image_known < 1).flatten(1).any(dim=1)
@@ -364,93 +383,6 @@ class Fillerbuster:
             raymaps[todo] = torch.where(views.rays_known[todo] > 0, raymaps[todo], recovered)
         ones = torch.ones_like(views.image_known)
         return Views(images=images, image_known=ones, raymaps=raymaps, rays_known=ones)
-
-
-def _check(views: Views) -> None:
-    if len(views) == 0:
-        raise ValueError("complete: expected at least one view, got none")
-    if min(views.size) < SIDE_MULTIPLE:
-        raise ValueError(
-            f"complete: expected views of at least {SIDE_MULTIPLE}x{SIDE_MULTIPLE} pixels, got "
-            f"{views.size[1]}x{views.size[0]}; "
-            "use larger images"
-        )
-    for what, values, known in (("pixels", views.images, views.image_known), ("rays", views.raymaps, views.rays_known)):
-        if not bool(torch.isfinite(known).all()) or float(known.min()) < 0 or float(known.max()) > 1:
-            raise ValueError(f"complete: the mask of known {what} must lie in [0, 1] (1 = known)")
-        if not values.is_floating_point():
-            raise ValueError(
-                f"complete: expected {what} in floating-point numbers, got {values.dtype}; colours are in [0, 1]"
-            )
-        broken = int(((~torch.isfinite(values)) & (known > 0)).any(dim=1).sum())
-        if broken:
-            raise ValueError(
-                f"complete: {broken} known {what} are NaN or infinite; mark them as unknown (mask 0) or repair them"
-            )
-        far = int(((values.abs() > _FARTHEST[what]) & (known > 0)).any(dim=1).sum())
-        if far:
-            raise ValueError(
-                f"complete: {far} known {what} are beyond {_FARTHEST[what]:g}; mark them as unknown (mask 0) or scale "
-                "them"
-            )
-
-
-def _check_current(current: Views, views: Views) -> None:
-    if len(current) != len(views) or current.size != views.size:
-        expected, got = (f"{len(some)} views of {some.size[1]}x{some.size[0]}" for some in (views, current))
-        raise ValueError(f"current: expected {expected} like the views to be completed, got {got}")
-    pixels, rays = only_known(current.images, current.image_known), only_known(current.raymaps, current.rays_known)
-    if not bool(torch.isfinite(pixels).all() & torch.isfinite(rays).all()):
-        raise ValueError(
-            "current: pixels or rays are NaN or infinite; pass whole views, such as an earlier answer of complete"
-        )
-
-
-def _counting(current: Views, views: Views) -> Float[Tensor, "n 32 h w"] | None:
-    """1 at the latents that are wholly known in current views or in those to be completed; None where the current ones
-    add nothing.
-
-    Where the least known pixel of a latent has a mask between 0 and 1 in the current views it is that, in quarters: it
-    starts in between.
-    """
-    rays_known = views.rays_known.maximum(current.rays_known)
-    known = known_latents(to_latent_grid(views.image_known), to_latent_grid(views.rays_known))
-    there = (views.image_known >= 1).to(current.image_known).maximum(current.image_known)
-    least = -F.max_pool2d(-there, kernel_size=_LATENT_PIXELS)
-    told = (least * _STARTS).floor() / _STARTS
-    rays = (to_latent_grid(rays_known) == 1).to(told)
-    counts = unsplit(*(part.expand(-1, LATENT_CHANNELS, -1, -1).to(known) for part in (told, rays)))
-    return None if torch.equal(counts, known) else counts
-
-
-def _padded(views: Views, *, mode: str = "constant") -> Views:
-    """Sides brought up to multiples of 16 with pixels and rays that are unknown."""
-    height, width = views.size
-    extra = (0, -width % SIDE_MULTIPLE, 0, -height % SIDE_MULTIPLE)
-    if not any(extra):
-        return views
-    return dataclasses.replace(
-        views, **{f.name: F.pad(getattr(views, f.name), extra, mode=mode) for f in dataclasses.fields(Views)}
-    )
-
-
-def _working(views: Views, device: torch.device) -> Views:
-    """As the networks take them: float32; raymaps that are more exact stay so until they are in the canonical frame."""
-    exact = torch.float32 if device.type == "mps" else torch.promote_types(views.raymaps.dtype, torch.float32)
-    single = {f.name: getattr(views, f.name).to(device, torch.float32) for f in dataclasses.fields(Views)}
-    return dataclasses.replace(views, **single | {"raymaps": views.raymaps.to(device, exact)})
-
-
-def _as_given(filled: Views, views: Views) -> Views:
-    """Cut to the size of the views, on their device and in their precision; what they know keeps its bits."""
-    height, width = views.size
-    cut = {
-        f.name: getattr(filled, f.name)[..., :height, :width].to(getattr(views, f.name))
-        for f in dataclasses.fields(Views)
-    }
-    cut["images"] = torch.where(views.image_known < 1, cut["images"], views.images)
-    cut["raymaps"] = torch.where(views.rays_known > 0, views.raymaps, cut["raymaps"])
-    return Views(**cut)
 
 
 __all__ = ["BUNDLED_MODEL", "LATENT_CHANNELS", "Fillerbuster", "SamplingConfig", "noise_of"]

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import logging
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from pathlib import Path
-from typing import Any, Literal
+from functools import cached_property
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -19,65 +13,37 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from fb_core.completion.brought_views import announcement_of_brought, brought_views, takes_brought
+from fb_core.completion.brought_views import announcement_of_brought
 from fb_core.completion.inpainters.grid_inpainter import GridInpainter
 from fb_core.completion.inpainters.lazy_inpainter import LazyInpainter
-from fb_core.completion.inpainting import announcement_of_inpainting, plan_inpainting, run_inpainting
 from fb_core.completion.options import CompletionConfig
-from fb_core.completion.planning.plan import CompletionPlan, plan_completion
-from fb_core.completion.requests import (
-    CompleteFrom,
-    CompleteMissing,
-    RegenerateRound,
-    RemoveView,
-    Request,
-    merged,
-    place_of,
-    plan_request,
-    standing_on,
-    without_view,
-)
-from fb_core.completion.results.completed_views import CompletedViews, round_title, views_target
-from fb_core.completion.rounds import Inpainter, announcement, open_cache, run_completion
-from fb_core.completion.trust import Trust, measured_trust
+from fb_core.completion.requests import RegenerateRound, Request
+from fb_core.completion.results.completed_views import CompletedViews
+from fb_core.completion.rounds import Inpainter
 from fb_core.data.capture.frames import Frame
 from fb_core.files.faults import Refused
-from fb_core.files.whole import remove_folder, whole_file
-from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.shell import Shell
-from fb_core.machine.precision import in_words
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager
 from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d, without_open3d
 from fb_nerfstudio.capture.start_points import start_points
-from fb_nerfstudio.capture.unseen import TRAINED_STEPS, free_space, seen_by_nobody_else, surface_points
 from fb_nerfstudio.checks.exports import refuse_empty_exports
 from fb_nerfstudio.checks.going_on import CaptureIdentity
-from fb_nerfstudio.generation.bank import Bank, without_requested
-from fb_nerfstudio.generation.first_guess import first_guess
-from fb_nerfstudio.generation.fitting_in import fitted_in, needed_by_splats
-from fb_nerfstudio.generation.missing import plan_missing
-from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn, report_of
-from fb_nerfstudio.generation.surroundings import (
-    Bars,
-    LazyViews,
-    own_randomness,
-    refusing,
-    release_memory,
-    save_checkpoint,
-    say_found,
-    splats_of,
-)
-from fb_nerfstudio.generation.trusted_views import surroundings_of
+from fb_nerfstudio.generation import due_rounds, requested, surroundings
+from fb_nerfstudio.generation.generation import Generation, steps_end
+from fb_nerfstudio.generation.state import GenerationState
+from fb_nerfstudio.generation.surroundings import own_randomness
 from fb_nerfstudio.refusal import refuse_bad_capture, refuse_bad_model
-from fb_nerfstudio.splats.all_or_nothing import undone_on_error
-from fb_nerfstudio.viewer import CompletionPanel, views_in_words
+from fb_nerfstudio.viewer import CompletionPanel
 
-COMPLETION_FOLDER = "completion"
-"""Where in the run's folder the generated views are written as a capture."""
-REPORT_NAME = "completion.json"
-"""Beside that folder: how far the model is believed, its rounds and the trust of every view."""
-_SURVEYED_CAMERAS = 48  # captured pictures that are rendered to learn where surfaces are when a request comes
 _logger = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class KeepsWhatIsTrained(Protocol):
+    """A trainer that saves what is trained before views are generated, which may take long, or fail."""
+
+    def generation_begins(self) -> None:
+        """Called before that."""
+        ...
 
 
 @dataclass
@@ -134,17 +100,10 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
             and "points3D_xyz" not in self.train_dataparser_outputs.metadata
         ):
             self._find_start_points()
-        self.completion_panel = CompletionPanel(
-            prompt=config.completion.prompt
-        )  # public: nerfstudio's viewer looks for it by type
+        # A public attribute: nerfstudio's viewer looks for it by type.
+        self.completion_panel = CompletionPanel(prompt=config.completion.prompt)
         self.completion_panel.captured = len(self.train_dataset)
-        self._bank: Bank | None = None
-        self._finished = False
-        self._trust: Trust | None = None  # in the model on this capture, once it is measured
-        self._rounds = Rounds()  # how far rounds are that are planned one after the other
-        self._outdated: list[int] = []  # rounds that were conditioned on anchors which have been generated anew since
-        self._given_up: set[int] = set()  # those of them that could not be generated
-        self.at_work = False
+        self.generation = GenerationState(self.completion_panel, self.device)
 
     def _find_start_points(self) -> None:
         """Give the pipeline points to start the splats from, where the capture brings none."""
@@ -162,24 +121,27 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
     @property
     def generated_views(self) -> CompletedViews | None:
         """Every generated view so far, None before there are any."""
-        return None if self._bank is None else self._bank.views
+        return self.generation.views
+
+    @property
+    def at_work(self) -> bool:
+        """Whether views are being generated: Ctrl-C then ends the training at once, and not after the iteration."""
+        return self.generation.at_work
 
     @property
     def generated_probability(self) -> float:
         """Probability that a step draws a generated view."""
-        if self._bank is None:
-            return 0.0
-        return self._bank.probability(most=self.config.completion.generated_share, captured=len(self.train_dataset))
+        bank, most = self.generation.bank, self.config.completion.generated_share
+        return 0.0 if bank is None else bank.probability(most=most, captured=len(self.train_dataset))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """A captured or a generated view, decided by the completion's seed and the step."""
-        if self._bank is not None:
-            completion = self.config.completion
-            index = self._bank.drawn(step, seed=completion.seed, probability=self.generated_probability)
+        bank, completion = self.generation.bank, self.config.completion
+        if bank is not None:
+            index = bank.drawn(step, seed=completion.seed, probability=self.generated_probability)
             if index is not None:
-                return self._bank.batch(
-                    index, as_float=self.config.cache_images_type == "float32", weight=completion.view_weight
-                )
+                as_float = self.config.cache_images_type == "float32"
+                return bank.batch(index, as_float=as_float, weight=completion.view_weight)
         return self.next_captured(step)
 
     # ------------------------------------------------------------------------------------------------------ generation
@@ -190,27 +152,25 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         """Checks before every iteration whether generated views are due and missing; refuses a broken model folder at
         once.
         """
-        if self.config.completion.enabled and not self._finished:
-            self._check_inpainter()
-        if not self._finished and (brought := len(self._brought_frames)):
-            CONSOLE.print(announcement_of_brought(brought, self.config.completion))
-        self.completion_panel.training_begins(
-            takes_requests=self.config.completion.enabled and self.config.completion.task == "new-views"
-        )
-        given = training_callback_attributes
-        if given.trainer is not None and self.config.completion.enabled and not self._finished:
-            self._say_if_it_ends_before(given.trainer)
+        given, completion = training_callback_attributes, self.config.completion
+        if completion.enabled and not self.generation.finished:
+            self.check_inpainter()
+        if not self.generation.finished and (brought := len(self._brought_frames)):
+            CONSOLE.print(announcement_of_brought(brought, completion))
+        self.completion_panel.training_begins(takes_requests=completion.enabled and completion.task == "new-views")
+        if given.trainer is not None and completion.enabled and not self.generation.finished:
+            self._say_if_it_ends_before(steps_end(given.trainer))
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
         return [
             *super().get_training_callbacks(given),
-            TrainingCallback([before], self._complete_when_due, args=[given]),
-            TrainingCallback([before], self._serve_next_request, args=[given]),
+            TrainingCallback([before], self.complete_when_due, args=[given]),
+            TrainingCallback([before], self.serve_next_request, args=[given]),
             TrainingCallback([after], lambda step: self.completion_panel.training_ended()),
         ]
 
-    def _say_if_it_ends_before(self, trainer: Any) -> None:
+    def _say_if_it_ends_before(self, last: int) -> None:
         """One sentence where the training is over before views are due."""
-        due, last = self.config.completion.at_step, trainer._start_step + trainer.config.max_num_iterations
+        due = self.config.completion.at_step
         if due >= last:
             CONSOLE.print(
                 f"Views are generated before step {due} (completion.at_step), but this training ends with step "
@@ -218,318 +178,70 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
                 f"generated. Train longer, or set --pipeline.datamanager.completion.at-step below {last}."
             )
 
-    def _complete_when_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
-        completion = self.config.completion
-        if not completion.enabled or self._finished or step < max(completion.at_step, self._rounds.due):
+    def complete_when_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Called before every iteration: generates what is due and missing, and takes what the capture brings."""
+        completion, state = self.config.completion, self.generation
+        if not completion.enabled or state.finished or step < max(completion.at_step, state.rounds.due):
             return
-        trainer: Any = attributes.trainer
-        if hasattr(trainer, "generation_begins"):  # not every trainer is ours
-            trainer.generation_begins()
-        with self._at_work(), own_randomness(self.device, seed=completion.seed, step=step):
-            self._complete(attributes, step)
+        if isinstance(attributes.trainer, KeepsWhatIsTrained):  # nerfstudio's own trainer does not
+            attributes.trainer.generation_begins()
+        with state.generating(), own_randomness(self.device, seed=completion.seed, step=step):
+            due_rounds.complete(self._generation(attributes), self._brought_frames, step)
 
-    def _complete(self, attributes: TrainingCallbackAttributes, step: int) -> None:
-        """Bring all generated views together: those that the capture brings along, and what is to be generated."""
-        brought = self._brought_frames if takes_brought(self.config.completion) else []
-        if not brought or self.config.completion.on_completed_capture == "extend":
-            while (due := self._generate(attributes, step)) is not None:
-                if due > step:  # the splats are trained on this round before the next one is planned
-                    return save_checkpoint(attributes.trainer, step)
-        if brought:  # last, in one step with the end: a run that goes on takes them once
-            self._take(brought, attributes, step)
-        self._finished = True
-        save_checkpoint(attributes.trainer, step)
+    def serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Called before every iteration: does what was asked for in the viewer, one request, whole or not at all.
+
+        What cannot be done is said there; training goes on.
+        """
+        state, completion = self.generation, self.config.completion
+        asked = self.completion_panel.requests.take()
+        request = asked or (state.next_outdated() if completion.enabled else None)
+        if request is None:
+            return
+        try:
+            with state.generating(), own_randomness(self.device, seed=completion.seed, step=step):
+                answer = requested.serve(self._generation(attributes), request, step)
+        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+            answer = self._refusal_of(request, error, by_person=asked is not None)
+        surroundings.release_memory()
+        CONSOLE.print(answer)
+        self.completion_panel.report(answer)
+
+    def _refusal_of(self, request: Request, error: Exception, *, by_person: bool) -> str:
+        """What a person reads of a request that could not be done, which goes to the log as well."""
+        unexpected = None if isinstance(error, ValueError) else error
+        _logger.warning("%s: not done: %s", type(request).__name__, error, exc_info=unexpected)
+        if not by_person and isinstance(request, RegenerateRound):
+            self.generation.given_up.add(request.number)  # stays outdated, but is not tried before every iteration
+            _logger.warning(
+                "Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number
+            )
+        return f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
+
+    def _generation(self, attributes: TrainingCallbackAttributes) -> Generation:
+        """This training, as generation sees it; nothing of it is kept here."""
+        assert attributes.pipeline is not None  # nerfstudio's trainer always gives it
+        splats: Any = attributes.pipeline.model  # a TrainedSplats
+        return Generation(
+            captured=self,
+            completion=self.config.completion,
+            state=self.generation,
+            load_inpainter=self.load_inpainter,
+            splats=splats,
+            optimizers=attributes.optimizers,
+            trainer=attributes.trainer,
+        )
 
     @cached_property
     def _brought_frames(self) -> list[Frame]:
         """Generated frames of the capture, with cameras in the world of the splats."""
         return self.dataparser.generated_frames() if isinstance(self.dataparser, NerfstudioWithoutOpen3d) else []
 
-    def _take(self, frames: list[Frame], attributes: TrainingCallbackAttributes, step: int) -> None:
-        """Put generated views that the capture brings along into the bank as a round of their own."""
-        bank, cameras = self.generated_views, self.captured_cameras()
-        taken = [] if bank is None else bank.rounds
-        number = 1 + max([self.config.completion.densify_rounds, *taken])
-        with refusing():
-            views = brought_views(frames, number=number, size=None if bank is None else bank.cameras.width)
-        scene = self._scene(splats_of(attributes), cameras, step, size=views.cameras.width)
-        views, added = self._fitted_in(views, attributes, scene.shell, cameras, step)
-        self._set_bank(merged(bank, (), views))
-        self._save_bank(attributes.trainer)
-        CONSOLE.print(
-            f"{views_in_words(len(views), 'generated ')} of the capture taken, {added} Gaussians placed in unseen "
-            "regions."
-        )
-
-    def _generate(self, attributes: TrainingCallbackAttributes, step: int) -> int | None:
-        """Generate the rounds that are due and missing; each is kept in the bank, in the run's folder and in a
-        checkpoint at once.
-
-        Returns the step before which the next round is due, None where there is none.
-        """
-        started = time.perf_counter()
-        config, splats, trainer = self.config.completion, splats_of(attributes), attributes.trainer
-        model, cameras = self._load_inpainter(), self.captured_cameras()
-        points = self._seen_points(splats, cameras, step)
-        inpaints, size = config.task == "inpaint", config.image_size or model.size
-        renders = config.start != "noise" and step >= TRAINED_STEPS
-        guess = partial(first_guess, splats, soft=config.start == "soft") if renders else None
-        generate = run_inpainting if inpaints else partial(run_completion, first_guess=guess)
-        if inpaints:
-            plan = plan_inpainting(cameras, points, config, size=size)
-        else:
-            done, _ = without_requested(self.generated_views)
-            one = (
-                former_of(done, splats, self._rounds.number, trained=step >= TRAINED_STEPS) if in_turn(config) else None
-            )
-            surveyed = cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)]
-            free = free_space(splats, surveyed) if one is not None and step >= TRAINED_STEPS else None
-            plan = plan_completion(cameras, points, config, size=size, known=self.known_parts, former=one, free=free)
-            if plan.covered is not None and step >= TRAINED_STEPS:
-                plan = needed_by_splats(plan, splats, cameras, self.known_parts)
-        done, _ = without_requested(self.generated_views)
-        self.completion_panel.coverage.show(plan)
-        if not plan.rounds and plan.covered is not None:
-            CONSOLE.print(announcement(plan, config, model))
-        if plan.rounds:
-            with refusing():
-                told = (
-                    announcement_of_inpainting(plan, config, model)
-                    if inpaints
-                    else announcement(plan, config, model, done=done)
-                )
-            CONSOLE.print(told)
-            if config.inpainter == "diffusion":
-                CONSOLE.print(f"The model's matrix products: {in_words(config.precision, self.device)}.")
-            context = LazyViews(lambda index: self.captured_view(index, cameras[index]), plan.context)
-            left = sum(done is None or one.number not in done.rounds for one in plan.rounds)
-            with Bars(self.completion_panel, len(plan.rounds)) as bars, refusing():
-                if config.trust == "measured" and not inpaints and self._trust is None:
-                    around = surroundings_of(plan.shell, splats, trained=step >= TRAINED_STEPS)
-                    self._trust = measured_trust(
-                        [*context],
-                        model,
-                        config,
-                        size=size,
-                        cache=open_cache(config),
-                        on_step=bars.trial,
-                        surroundings=around,
-                    )
-                    CONSOLE.print(self._trust.in_words)
-                    if self._trust.hidden:  # a kill in the first round costs that round, not the trial too
-                        save_checkpoint(trainer, step)
-                for views in generate(plan, context, model, config, done=done, on_step=bars.step, on_found=say_found):
-                    left -= 1
-                    self._set_bank(merged(self.generated_views, (), self._believed(views)))
-                    if left > 0:
-                        save_checkpoint(trainer, step)
-        del model
-        release_memory()
-        self.completion_panel.coverage.generated()
-        turns = in_turn(config)
-        new, other = self._to_fit_in(plan)
-        if new is not None:
-            new, added = self._fitted_in(new, attributes, plan.shell, cameras, step)
-            self._set_bank(
-                new
-                if other is None
-                else CompletedViews.cat([*([other] if turns else []), new, *([] if turns else [other])])
-            )
-        due = None
-        if turns:
-            trains_until = None if trainer is None else trainer._start_step + trainer.config.max_num_iterations
-            due = due_after(config, self._rounds, plan, self._trust, step=step, last=trains_until)
-            self._rounds = self._rounds.after(plan, step=step, due=step if due is None else due)
-        if new is not None:
-            folder = self._save_bank(trainer)
-            where = "" if folder is None else f", saved in {folder}"
-            seconds = time.perf_counter() - started
-            CONSOLE.print(
-                f"{len(new)} generated views in {seconds:.0f} s, {added} Gaussians placed in unseen regions{where}."
-            )
-        return due
-
-    def _to_fit_in(self, plan: CompletionPlan) -> tuple[CompletedViews | None, CompletedViews | None]:
-        """The generated views that are new to the splats, and all others: of rounds in turn those of this plan, else
-        all automatic ones.
-        """
-        done, requested = without_requested(self.generated_views)
-        if done is None or not in_turn(self.config.completion):
-            return done, requested
-        numbers = {one.number for one in plan.rounds}
-        bank = self.generated_views
-        assert bank is not None  # done is a part of it
-        mine = [place for place, origin in enumerate(bank.origins) if origin.round in numbers]
-        rest = [place for place in range(len(bank)) if place not in set(mine)]
-        return (bank[mine] if mine else None), (bank[rest] if rest else None)
-
-    def _believed(self, views: CompletedViews) -> CompletedViews:
-        """The views, believed as far as the model is, once that is measured."""
-        return views.believed(None if self._trust is None else self._trust.value)
-
-    def _serve_next_request(self, attributes: TrainingCallbackAttributes, step: int) -> None:
-        """Do what was asked for in the viewer, one request before each iteration, whole or not at all.
-
-        What cannot be done is said there; training goes on.
-        """
-        asked = self.completion_panel.requests.take()
-        request = asked or self._next_outdated()
-        if request is None:
-            return
-        try:
-            with (
-                self._at_work(),
-                own_randomness(self.device, seed=self.config.completion.seed, step=step),
-                self._unchanged_on_error(attributes),
-            ):
-                said = self._serve(request, attributes, step)
-        except (ValueError, RuntimeError, OSError, MemoryError) as error:
-            said = f"Not done: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
-            _logger.warning(
-                "%s: not done: %s",
-                type(request).__name__,
-                error,
-                exc_info=None if isinstance(error, ValueError) else error,
-            )
-            if asked is None and isinstance(
-                request, RegenerateRound
-            ):  # it stays outdated, but is not tried before every iteration
-                self._given_up.add(request.number)
-                _logger.warning(
-                    "Round %d stays outdated: ask for it in the viewer, or go on with --load-dir", request.number
-                )
-        release_memory()
-        CONSOLE.print(said)
-        self.completion_panel.report(said)
-
-    @contextmanager
-    def _at_work(self) -> Iterator[None]:
-        """Meanwhile Ctrl-C ends the training at once, and not after the iteration: views are generated."""
-        self.at_work = True
-        try:
-            yield
-        finally:
-            self.at_work = False
-
-    @contextmanager
-    def _unchanged_on_error(self, attributes: TrainingCallbackAttributes) -> Iterator[None]:
-        """Bank, Gaussians and what is outdated are as they were where the block ends with an error, in the run's folder
-        too.
-        """
-        views, bank, outdated = self.generated_views, self._bank, list(self._outdated)
-        try:
-            with undone_on_error(splats_of(attributes), attributes.optimizers):
-                yield
-        except BaseException:
-            changed, self._bank, self._outdated = self._bank is not bank, bank, outdated
-            if changed:
-                try:
-                    self.completion_panel.show(views)
-                    self._save_bank(attributes.trainer)
-                except Exception:  # of drawing or of the disk: the checkpoint has the views
-                    _logger.warning(
-                        "The run's folder or the viewer may show views that were given up again", exc_info=True
-                    )
-            raise
-
-    def _serve(self, request: Request, attributes: TrainingCallbackAttributes, step: int) -> str:
-        """Change the bank as asked, in the checkpoint and the run's folder too; returns what was done. Raises
-        ValueError.
-        """
-        if isinstance(request, RemoveView):
-            said = self._remove(request, attributes)
-        else:
-            said = self._generate_requested(request, attributes, step)
-        self._save_bank(attributes.trainer)
-        save_checkpoint(attributes.trainer, step)
-        return said
-
-    def _next_outdated(self) -> RegenerateRound | None:
-        """A round that stands on anchors which are no more, to be generated as it was, from the new ones."""
-        there = [] if self.generated_views is None else self.generated_views.rounds
-        self._outdated = [number for number in self._outdated if number in there]
-        waiting = [number for number in self._outdated if number not in self._given_up]
-        return RegenerateRound(number=waiting[0], seed=None) if self.config.completion.enabled and waiting else None
-
-    def _remove(self, request: RemoveView, attributes: TrainingCallbackAttributes) -> str:
-        before, place = self.generated_views, place_of(self.generated_views, request.key)
-        after = without_view(before, request.key)
-        assert before is not None and place is not None  # without_view has raised otherwise
-        gone = self._forget(before[[place]], after, self.captured_cameras(), attributes)
-        self._set_bank(after)
-        return (
-            f"1 view removed, with {gone} Gaussians that no other view shows; {views_in_words(len(after or ()))} left."
-        )
-
-    def _forget(
-        self,
-        leaving: CompletedViews,
-        staying: CompletedViews | None,
-        cameras: list[Pinholes],
-        attributes: TrainingCallbackAttributes,
-    ) -> int:
-        """Take away the Gaussians that only these views had a say in; returns how many."""
-        splats = splats_of(attributes)
-        if not hasattr(splats, "remove_gaussians"):
-            return 0
-        gone = seen_by_nobody_else(splats.means, leaving, staying, cameras, self.known_parts)
-        return splats.remove_gaussians(gone, attributes.optimizers)
-
-    def _generate_requested(
-        self,
-        request: CompleteFrom | CompleteMissing | RegenerateRound,
-        attributes: TrainingCallbackAttributes,
-        step: int,
-    ) -> str:
-        """Views from where a person stands, or a round anew, fitted into the bank as automatic ones are; returns what
-        was done.
-        """
-        started = time.perf_counter()
-        config, splats = self.config.completion, splats_of(attributes)
-        model, cameras = self._load_inpainter(), self.captured_cameras()
-        scene = self._scene(splats, cameras, step, size=config.image_size or model.size)
-        if isinstance(request, CompleteMissing):
-            points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
-            whole, parts = self.generated_views, self.known_parts
-            planned = plan_missing(
-                request, scene, whole, splats, cameras, points, config, parts, trained=step >= TRAINED_STEPS
-            )
-        else:
-            planned = plan_request(request, scene, self.generated_views, cameras, config, self.known_parts)
-        context = [self.captured_view(index, cameras[index]) for index in planned.plan.context]
-        with Bars(self.completion_panel, 1) as bars:
-            (new,) = run_completion(
-                planned.plan, context, model, config, done=planned.done, on_step=bars.step, on_found=say_found
-            )
-        del model
-        release_memory()
-        if self.generated_views is not None and planned.replaces:
-            self._forget(self.generated_views[planned.replaces], planned.done, cameras, attributes)
-        new, added = self._fitted_in(self._believed(new), attributes, scene.shell, cameras, step, holes_only=True)
-        self._set_bank(merged(self.generated_views, planned.replaces, new))
-        origin, seconds = new.origins[0], time.perf_counter() - started
-        said = (
-            f"{round_title(origin.role, origin.round)}: {views_in_words(len(new))} in {seconds:.0f} s with seed "
-            f"{origin.seed}, "
-        )
-        if isinstance(request, RegenerateRound):
-            followers = [] if request.seed is None else standing_on(self.generated_views, request.number)
-            self._outdated = sorted({*self._outdated, *followers} - {request.number})
-            self._given_up -= {request.number, *followers}
-        follow = f" To be generated anew from the new anchors: {len(self._outdated)} rounds." if self._outdated else ""
-        return f"{said}{added} Gaussians placed in holes.{follow}"
-
-    def _scene(self, splats: Any, cameras: list[Pinholes], step: int, *, size: int) -> CompletionPlan:
-        """Shape, shell and context of the capture: a plan without rounds."""
-        points = self._seen_points(splats, cameras[:: -(-len(cameras) // _SURVEYED_CAMERAS)], step)
-        survey = dataclasses.replace(self.config.completion, anchor_views=0, densify_rounds=0, camera_path=None)
-        return plan_completion(cameras, points, survey, size=size, known=self.known_parts)
-
-    def _check_inpainter(self) -> None:
+    def check_inpainter(self) -> None:
         """Raises Refused with one sentence for a model folder that cannot be used."""
         refuse_bad_model(self.config.completion)
 
-    def _load_inpainter(self) -> Inpainter:
+    def load_inpainter(self) -> Inpainter:
         """The diffusion model for the training device. Raises Refused with one sentence when its folder is broken."""
         try:
             if self.config.completion.inpainter == "grid":
@@ -540,76 +252,11 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         except ValueError as error:
             raise Refused(str(error)) from None
 
-    def _seen_points(self, splats: Any, cameras: list[Pinholes], step: int) -> torch.Tensor | None:
-        """Surface points: from structure from motion if the capture brings them, and from the splats once they are
-        trained.
-        """
-        known = self.train_dataparser_outputs.metadata.get("points3D_xyz")
-        groups = [] if known is None else [known.cpu().float()]
-        if step >= TRAINED_STEPS:
-            groups.append(surface_points(splats, cameras))
-        return torch.cat(groups) if groups else None
-
-    def _fitted_in(
-        self,
-        views: CompletedViews,
-        attributes: TrainingCallbackAttributes,
-        shell: Shell,
-        cameras: list[Pinholes],
-        step: int,
-        holes_only: bool = False,
-    ) -> tuple[CompletedViews, int]:
-        """The views as they are to be trained on, and how many Gaussians were added for them."""
-        return fitted_in(
-            views,
-            splats_of(attributes),
-            attributes.optimizers,
-            self.config.completion,
-            shell=shell,
-            captured=cameras,
-            known=self.known_parts,
-            trained=step >= TRAINED_STEPS,
-            holes_only=holes_only,
-            curve=None if self._trust is None else self._trust.curve,
-        )
-
     # ----------------------------------------------------------------------------------------------------- persistence
-
-    def _set_bank(self, views: CompletedViews | None) -> None:
-        self._bank = None if views is None else Bank.of(views, self.device)
-        self.completion_panel.show(views)
-
-    def _save_bank(self, trainer: Any) -> Path | None:
-        """Write the bank as a capture into the run's folder and return where; None without a trainer, and where
-        something else stands.
-        """
-        if trainer is None:
-            return None
-        data = self.config.data or self.config.dataparser.data
-        target = views_target(Path(trainer.base_dir) / COMPLETION_FOLDER, inputs=() if data is None else (Path(data),))
-        try:
-            target.check()
-        except ValueError as error:
-            _logger.warning("%s; the generated views are in the checkpoint alone", error)
-            return None
-        with whole_file(target.folder.with_name(REPORT_NAME)) as unfinished:
-            told = report_of(self._trust, self._rounds, self.generated_views)
-            unfinished.write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
-        if self.generated_views is not None:
-            self.generated_views.save_capture(target)
-        else:
-            remove_folder(target)
-        return target.folder
 
     def get_extra_state(self) -> dict[str, Any]:
         """The bank and the place in the sequence of draws; lands in the checkpoint as ``datamanager._extra_state``."""
-        return {
-            "views": None if self.generated_views is None else self.generated_views.state(),
-            "finished": self._finished,
-            "outdated": list(self._outdated),
-            "trust": None if self._trust is None else self._trust.value,
-            "measured": None if self._trust is None else self._trust.state(),
-            "rounds": self._rounds.state(),
+        return self.generation.state() | {
             "start_points": self._own_points,
             "captured_draws": self.captured_draws,
             "capture": CaptureIdentity.of(self.train_dataparser_outputs).state(),
@@ -617,14 +264,9 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`get_extra_state` gave; nothing is generated again."""
-        self._finished = bool(state["finished"])
         self.captured_draws = int(state["captured_draws"])
-        self._outdated = [int(number) for number in state.get("outdated", ())]
-        self._trust = Trust.restored(state.get("measured"), state.get("trust"))
-        if (
-            state.get("start_points") is not None
-        ):  # not triangulated again: interrupted rounds are planned from the very same points
-            self._own_points = state["start_points"].cpu()
+        points = state.get("start_points")
+        if points is not None:  # not triangulated again: interrupted rounds are planned from the very same points
+            self._own_points = points.cpu()
             self.train_dataparser_outputs.metadata["points3D_xyz"] = self._own_points
-        self._set_bank(None if state["views"] is None else CompletedViews.from_state(state["views"]))
-        self._rounds = Rounds.from_state(state.get("rounds"), without_requested(self.generated_views)[0])
+        self.generation.restore(state)

@@ -18,7 +18,8 @@ from fb_core.data.capture.camera_path import read_camera_path
 from fb_core.data.capture.captures import validate_capture
 from fb_core.data.capture.frames import Capture, Frame
 from fb_core.files.faults import CannotWrite, Refused, is_of_the_disk
-from fb_core.inpainter import BUNDLED_MODEL, SIDE_MULTIPLE
+from fb_core.inpainter import BUNDLED_MODEL
+from fb_core.memory.budget import SIDE_MULTIPLE
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, Protocol, cast
 
 import numpy as np
 import torch
@@ -102,6 +102,13 @@ class FillerbusterTrainerConfig(TrainerConfig):
             unfinished.write_text(yaml.dump(self), "utf8")
 
 
+class _Generates(Protocol):
+    """What the trainer needs of its datamanager (:mod:`fb_nerfstudio.datamanager`)."""
+
+    at_work: bool
+    """Whether views are being generated."""
+
+
 class _AskedToStop(SystemExit):
     """A signal asks the training to end; nothing of its state is half changed."""
 
@@ -171,7 +178,8 @@ class FillerbusterTrainer(Trainer):
         """Called in the main thread when a signal comes. A second one ends the training at once, whatever it does."""
         if self._asked:
             self._stop(number)
-        if self._in_step and self._unsaved is not None and not getattr(self.pipeline.datamanager, "at_work", False):
+        datamanager = cast(_Generates, self.pipeline.datamanager)
+        if self._in_step and self._unsaved is not None and not datamanager.at_work:
             self._asked = number  # the step's tensors do not belong together before its end
         else:
             raise _AskedToStop(number)

@@ -29,7 +29,9 @@ class Counts:
     arguments_per_function: dict[str, int] = field(default_factory=dict)
     """Without ``self`` and ``cls``."""
     fields_of_options: dict[str, int] = field(default_factory=dict)
-    """Of dataclasses that somebody sets: those whose names end with Config or Options, and those of a command."""
+    """Of dataclasses that somebody sets: those whose names end with Config or Options, and those of a command. Private
+    classes and fields (nerfstudio's ``_target``) are nobody's to set.
+    """
     without_docstring: list[str] = field(default_factory=list)
     """Public functions, methods and classes; overridden methods count too."""
     raising_in_silence: list[str] = field(default_factory=list)
@@ -73,8 +75,9 @@ def _look_into(tree: ast.AST, place: str, counts: Counts, public: bool = True) -
             known = public and not node.name.startswith("_")
             if known and ast.get_docstring(node) is None:
                 counts.without_docstring.append(f"{place}.{node.name}")
-            if node.name.endswith(("Config", "Options")) or (".commands." in f"{place}." and _is_dataclass(node)):
-                fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
+            of_command = ".commands." in f"{place}." and _is_dataclass(node) and known
+            if node.name.endswith(("Config", "Options")) or of_command:
+                fields = [one for one in node.body if isinstance(one, ast.AnnAssign) and _is_public(one.target)]
                 if fields:
                     counts.fields_of_options[f"{place}.{node.name}"] = len(fields)
             _look_into(node, f"{place}.{node.name}", counts, known)
@@ -96,6 +99,10 @@ def _look_into(tree: ast.AST, place: str, counts: Counts, public: bool = True) -
 
 def _is_dataclass(node: ast.ClassDef) -> bool:
     return any("dataclass" in ast.unparse(one) for one in node.decorator_list)
+
+
+def _is_public(target: ast.expr) -> bool:
+    return not ast.unparse(target).startswith("_")
 
 
 def _raises(node: ast.AST) -> bool:

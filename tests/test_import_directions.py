@@ -24,6 +24,7 @@ FLOORS = (
     "fb_core.sampling",
     "fb_core.checkpoint",
     "fb_core.memory",
+    "fb_core.given_views",
     "fb_core.inpainter",
     "fb_core.splatting",
     "fb_core.data",

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import encode_in_chunks, encode_known, join, stacked_facts, unsplit
+from fb_core.conditioning import Encoding, encode_in_chunks, encode_known, join, stacked_facts, unsplit
 from fb_core.data.rooms.room import require_family
 from fb_core.evaluation.capture_questions import CaptureViews
 from fb_core.evaluation.completion import RoomViews, unseen_room
@@ -142,7 +142,7 @@ def conditional_validation_loss(
         torch.ones_like(known),
         image_vae=model.image_vae,
         raymap_vae=model.raymap_vae,
-        views_at_once=_CHUNK,
+        encoding=Encoding(views_at_once=_CHUNK),
         transformer=model.dit.config,
     )
     facts = stacked_facts([conditioning], model.dit.config)

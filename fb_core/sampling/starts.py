@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import LATENT_CHANNELS, Conditioning, split, unsplit
+from fb_core.conditioning import FACTOR, LATENT_CHANNELS, Conditioning, split, unsplit
 from fb_core.flow import at_time
+from fb_core.masks import to_latent_grid
 from fb_core.sampling.integration.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.integration.solvers import VelocityField
 from fb_core.sampling.integration.time_grids import reference_grid
+from fb_core.views import Views
+
+_JOINING_TIMES = 4  # steps in which a mask between 0 and 1 says when a latent joins the sampling
 
 
 def started(
@@ -47,6 +53,23 @@ def known_latents(
         (known == 1).to(known.dtype).expand(-1, LATENT_CHANNELS, -1, -1) for known in (image_known, rays_known)
     )
     return unsplit(image, rays)
+
+
+def joining(current: Views, views: Views) -> Float[Tensor, "n 32 h w"] | None:
+    """Which latents start from what is current: 1 where they are wholly known in current views or in those to be
+    completed, 0 where they start from noise; None where the current ones add nothing.
+
+    Where the least known pixel of a latent has a mask between 0 and 1 in the current views it is that, in quarters: it
+    starts in between.
+    """
+    rays_known = views.rays_known.maximum(current.rays_known)
+    known = known_latents(to_latent_grid(views.image_known), to_latent_grid(views.rays_known))
+    there = (views.image_known >= 1).to(current.image_known).maximum(current.image_known)
+    least = -F.max_pool2d(-there, kernel_size=FACTOR)
+    pixels = (least * _JOINING_TIMES).floor() / _JOINING_TIMES
+    rays = (to_latent_grid(rays_known) == 1).to(pixels)
+    joined = unsplit(*(part.expand(-1, LATENT_CHANNELS, -1, -1).to(known) for part in (pixels, rays)))
+    return None if torch.equal(joined, known) else joined
 
 
 def imposed(

@@ -15,7 +15,8 @@ from torch import nn
 
 from fb_core import checkpoint
 from fb_core.conditioning import encode_frozen
-from fb_core.data.training.folders import Resolution, TrainingData, at_resolutions, multi_view_source, training_source
+from fb_core.data.training.folders import Resolution, at_resolutions, multi_view_source, training_source
+from fb_core.data.training.named_data import TrainingData
 from fb_core.data.training.sequences import PoolConfig
 from fb_core.data.training.task import Source
 from fb_core.files.whole import whole_file

@@ -15,47 +15,18 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Bool, Float
-from nerfstudio.models.base_model import Model
 from torch import Tensor
 
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import Shell, intersect
 from fb_core.geometry.viewpoints.paths import seen_by
 from fb_core.masks import resampled
-from fb_nerfstudio.bridge import to_nerfstudio
+from fb_nerfstudio.capture.splat_renders import FIRM, SMALL_SIDE, Rendered, coarse
 
-SOLID = 0.5
-"""Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
-FIRM = 0.75
-"""Accumulation from which the splats' colours are believed beside the captured pictures, and as a start of generation.
-(A room at step 500: 14 dB from 0.5 on, which generated views exceed, 19 dB from 0.75 on, 27 dB from 0.95 on.)
-"""
 _OPAQUE = 0.95  # accumulation from which a render's colour is that of the splats, without the background
 _BESIDE = 0.5  # how far beside, as a part of the picture's side
-TRAINED_STEPS = 100
-"""Steps after which the splats' own depth and accumulation are believed."""
-# Pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures
-_SIDE = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rendered:
-    """What the splats look like from some cameras, on the CPU."""
-
-    depth: Float[Tensor, "n h w"]
-    """Expected z-depth in scene units; means nothing where accumulation is low."""
-    accumulation: Float[Tensor, "n h w"]
-    """Opacity in [0, 1]."""
-    rgb: Float[Tensor, "n 3 h w"]
-    """Colours in [0, 1], over the model's background where the splats are not opaque."""
-
-    @property
-    def solid(self) -> Bool[Tensor, "n h w"]:
-        """True where splats cover the pixel at a depth that means something."""
-        return (self.accumulation >= SOLID) & torch.isfinite(self.depth) & (self.depth > 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,59 +39,11 @@ class Unseen:
     """World points of the pixels on the shell; infinite where a ray never meets it."""
 
 
-def coarse(cameras: Pinholes) -> Pinholes:
-    """The same cameras with small pictures, on the CPU."""
-    scale = min(1.0, _SIDE / max(cameras.width, cameras.height))
-    return cameras.to("cpu", torch.float32).scaled(
-        max(1, round(cameras.width * scale)), max(1, round(cameras.height * scale))
-    )
-
-
-@torch.no_grad()
-def render_geometry(model: Model, cameras: Pinholes) -> Rendered:
-    """Colours, depth and accumulation of the splats from each camera, in evaluation mode; the training mode is
-    restored. On the CPU.
-    """
-    was_training = model.training
-    model.eval()
-    try:
-        outputs = [
-            model.get_outputs_for_camera(to_nerfstudio(cameras[index], model.device)) for index in range(len(cameras))
-        ]
-    finally:
-        model.train(was_training)
-    return Rendered(
-        depth=torch.stack([one["depth"][..., 0].float().cpu() for one in outputs]),
-        accumulation=torch.stack([one["accumulation"][..., 0].float().cpu() for one in outputs]),
-        rgb=torch.stack([one["rgb"].movedim(-1, 0).float().cpu() for one in outputs]),
-    )
-
-
-def surface_points(model: Model, cameras: Sequence[Pinholes], *, limit: int = 20000) -> Float[Tensor, "m 3"]:
-    """World points of what the splats show in the captured cameras (at most ``limit``, evenly spread over the
-    pictures).
-    """
-    groups = []
-    for camera in cameras:
-        small = coarse(camera)
-        rendered = render_geometry(model, small)
-        groups.append(small.unproject(rendered.depth)[rendered.solid])
-    points = torch.cat(groups) if groups else torch.empty(0, 3)
-    return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
-
-
-def free_space(model: Model, cameras: Sequence[Pinholes]) -> FreeSpace:
-    """What rays of the captured cameras have crossed on their way to the surfaces that the splats show."""
-    small = [coarse(camera) for camera in cameras]
-    rendered = [render_geometry(model, camera) for camera in small]
-    return FreeSpace(cameras=tuple(small), depth=tuple(torch.where(one.solid, one.depth, 0.0)[0] for one in rendered))
-
-
 def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:
     """The known-mask of a captured picture, small: True where most of a cell is known; None when all is."""
     if bool((known == 1).all()):
         return None
-    scale = min(1.0, _SIDE / max(known.shape[1:]))
+    scale = min(1.0, SMALL_SIDE / max(known.shape[1:]))
     size = [max(1, round(side * scale)) for side in known.shape[1:]]
     return F.interpolate(known[None], size=size, mode="area")[0, 0] >= 0.5
 

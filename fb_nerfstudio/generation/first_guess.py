@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,7 +9,7 @@ from fb_core.data.telea import inpainted
 from fb_core.geometry.cameras import Pinholes
 from fb_core.masks import grow_hole
 from fb_core.views import Views
-from fb_nerfstudio.capture.unseen import FIRM, SOLID, render_geometry
+from fb_nerfstudio.capture.splat_renders import FIRM, SOLID, TrainedSplats, render_geometry
 
 # How far half opaque splats decide where generation starts: half way between noise and where it starts from firm ones
 _HALF = 0.5
@@ -19,7 +17,7 @@ _HALF = 0.5
 _CONTINUED = 4
 
 
-def first_guess(splats: Any, cameras: Pinholes, *, soft: bool = False) -> Views | None:
+def first_guess(splats: TrainedSplats, cameras: Pinholes, *, soft: bool = False) -> Views | None:
     """The splats' renders, known where accumulation is at least `FIRM` and a few inpainted pixels beyond; None where it
     is nowhere.
 

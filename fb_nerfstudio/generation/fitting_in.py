@@ -5,29 +5,17 @@ there are none.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
 
 import torch
-from jaxtyping import Bool
-from nerfstudio.engine.optimizers import Optimizers
-from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.pixel_trust import Curve
 from fb_core.completion.planning.plan import CompletionPlan
 from fb_core.completion.results.completed_views import CompletedViews
-from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
-from fb_nerfstudio.capture.unseen import (
-    SOLID,
-    coarse,
-    find_unseen,
-    render_geometry,
-    unseen_gaussians,
-    with_matched_colors,
-    with_unseen_masks,
-)
+from fb_nerfstudio.capture.splat_renders import SOLID, coarse, render_geometry
+from fb_nerfstudio.capture.unseen import find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
+from fb_nerfstudio.generation.scene import TrainedScene
 from fb_nerfstudio.generation.trusted_views import with_pixel_trust
 
 _LEAST_UNSEEN = 0.02  # of a view's pixels: with fewer to train on it is not generated
@@ -35,14 +23,10 @@ _LEAST_UNSEEN = 0.02  # of a view's pixels: with fewer to train on it is not gen
 
 def fitted_in(
     views: CompletedViews,
-    splats: Any,
-    optimizers: Optimizers | None,
+    scene: TrainedScene,
     config: CompletionConfig,
     *,
     shell: Shell,
-    captured: Sequence[Pinholes],
-    known: Sequence[Bool[Tensor, "_h _w"] | None],
-    trained: bool,
     holes_only: bool = False,
     curve: Curve | None = None,
 ) -> tuple[CompletedViews, int]:
@@ -50,13 +34,9 @@ def fitted_in(
 
     Args:
         views: as they were generated.
-        splats: the model that is trained; Gaussians are added if it can take some.
-        optimizers: its optimizers.
+        scene: capture and splats; these get the Gaussians.
         config: which of all this is wanted.
         shell: where the surface is guessed to be.
-        captured: the capture's cameras.
-        known: of each captured picture its known part.
-        trained: whether the splats' depth and opacity are to be believed.
         holes_only: place Gaussians only where no splats are.
         curve: from what speaks for and against a pixel to its trust; None leaves the trust of the views as it is.
 
@@ -64,13 +44,13 @@ def fitted_in(
     """
     if (
         config.task == "inpaint"
-    ):  # the capture's own cameras: masks and colours are right already, and depth is nobody's business
+    ):  # the capture's own cameras: masks and colours are right already, and depth is nobody's
         return views, 0
-    places = config.seed_gaussians and hasattr(splats, "add_gaussians")
+    splats, places = scene.splats, config.seed_gaussians
     if not places and config.generated_pixels == "all" and curve is None:
         return views, 0
-    rendered = render_geometry(splats, coarse(views.cameras)) if trained else None
-    unseen = find_unseen(views.cameras, captured, shell, rendered, known)
+    rendered = render_geometry(splats, coarse(views.cameras)) if scene.is_trained else None
+    unseen = find_unseen(views.cameras, scene.cameras, shell, rendered, scene.known)
     views = with_pixel_trust(views, unseen, rendered, shell, curve)
     if config.match_colors and rendered is not None:
         views = with_matched_colors(views, unseen, rendered)
@@ -81,30 +61,25 @@ def fitted_in(
     if holes_only and rendered is not None:
         unseen = dataclasses.replace(unseen, mask=unseen.mask & (rendered.accumulation < SOLID))
     generator = torch.Generator().manual_seed(config.seed)
-    points, colors = unseen_gaussians(
-        views, unseen, limit=_room(splats, config.max_seed_gaussians), generator=generator
-    )
-    return views, splats.add_gaussians(points, colors, optimizers) if len(points) else 0
+    limit = most_seeds(config.max_seed_gaussians, splats.room)
+    points, colors = unseen_gaussians(views, unseen, limit=limit, generator=generator)
+    return views, splats.add_gaussians(points, colors, scene.optimizers) if len(points) else 0
 
 
-def _room(splats: Any, most: int) -> int:
-    """How many Gaussians generated views may get: half of what the cap leaves free. The other half is for what the
-    capture still grows.
+def most_seeds(asked: int, room: int | None) -> int:
+    """How many Gaussians generated views may get: half of the room there is (None is room without end). The other half
+    is for what the capture still grows.
     """
-    cap = getattr(getattr(splats, "config", None), "max_gaussians", None)
-    return most if cap is None else min(most, max(0, cap - splats.num_points) // 2)
+    return asked if room is None else min(asked, room // 2)
 
 
-def needed_by_splats(
-    plan: CompletionPlan, splats: Any, captured: Sequence[Pinholes], known: Sequence[Bool[torch.Tensor, "_h _w"] | None]
-) -> CompletionPlan:
+def needed_by_splats(plan: CompletionPlan, scene: TrainedScene) -> CompletionPlan:
     """The plan without the views of which the capture shows all, as far as trained splats tell: nothing of them would
     be trained on.
     """
     useless = []
     for planned in plan.rounds:
-        unseen = find_unseen(
-            planned.cameras, captured, plan.shell, render_geometry(splats, coarse(planned.cameras)), known
-        )
+        rendered = render_geometry(scene.splats, coarse(planned.cameras))
+        unseen = find_unseen(planned.cameras, scene.cameras, plan.shell, rendered, scene.known)
         useless.append(unseen.mask.flatten(1).float().mean(dim=1) < _LEAST_UNSEEN)
     return plan.without(useless)

@@ -17,7 +17,7 @@ from fb_core.completion.planning.plan import CompletionPlan, Former
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.trust import Trust
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.capture.unseen import coarse, render_geometry
+from fb_nerfstudio.capture.splat_renders import TrainedSplats, coarse, render_geometry
 
 _BELIEVED = 2 * LEAST  # trust from which a pixel counts as seen: better than the simple baselines at all
 
@@ -104,8 +104,10 @@ def due_after(
     return step if last is not None and later >= last else later
 
 
-def former_of(done: CompletedViews | None, splats: Any, number: int, *, trained: bool) -> Former:
-    """What the views so far show: their pixels that are believed, and that the splats show once they are trained."""
+def former_of(done: CompletedViews | None, splats: TrainedSplats | None, number: int) -> Former:
+    """What the views before round ``number`` show: their pixels that are believed, and that the splats show once they
+    are trained (None before).
+    """
     if done is None or number == 0:
         return Former(number=number)
     small = coarse(done.cameras)
@@ -113,7 +115,7 @@ def former_of(done: CompletedViews | None, splats: Any, number: int, *, trained:
         done.pixel_trust.movedim(-1, 1).cpu().float() / 255, size=(small.height, small.width), mode="area"
     )[:, 0]
     shown = trust > _BELIEVED
-    if trained:
+    if splats is not None:
         shown &= render_geometry(splats, small).solid
     return Former(number=number, cameras=tuple(_single(small)), shown=tuple(shown))
 

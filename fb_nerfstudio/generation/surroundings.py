@@ -1,6 +1,4 @@
-"""What surrounds a generation inside a training: progress, one sentence for refusals, randomness, memory,
-checkpoints.
-"""
+"""What surrounds a generation inside a training: progress, one sentence for refusals, randomness, memory."""
 
 from __future__ import annotations
 
@@ -10,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -42,12 +39,6 @@ def refusing() -> Iterator[None]:
         yield
     except ValueError as error:
         raise Refused(str(error)) from None
-
-
-def splats_of(attributes: TrainingCallbackAttributes) -> Any:
-    """The splat model that is being trained."""
-    assert attributes.pipeline is not None  # nerfstudio's trainer always gives it
-    return attributes.pipeline.model
 
 
 class LazyViews(Sequence[CapturedView]):
@@ -110,11 +101,3 @@ def own_randomness(device: torch.device | str, *, seed: int, step: int) -> Itera
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(mixed(seed, step))
         yield
-
-
-def save_checkpoint(trainer: Any, step: int) -> None:
-    """A checkpoint of the state before this step; a resumed run begins with it (with step 1 where there is none
-    before).
-    """
-    if trainer is not None:
-        trainer.save_checkpoint(max(step - 1, 0))

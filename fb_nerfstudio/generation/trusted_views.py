@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +18,8 @@ from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.trust import Surroundings
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell, intersect
-from fb_nerfstudio.capture.unseen import FIRM, Rendered, Unseen, coarse, render_geometry
+from fb_nerfstudio.capture.splat_renders import FIRM, Rendered, TrainedSplats, coarse, render_geometry
+from fb_nerfstudio.capture.unseen import Unseen
 
 
 def shell_depth(shell: Shell, cameras: Pinholes) -> Float[Tensor, "n h w"]:
@@ -33,12 +33,12 @@ def shell_depth(shell: Shell, cameras: Pinholes) -> Float[Tensor, "n h w"]:
     return (distance * torch.einsum("nhwc,nc->nhw", directions, nearby.rotations[:, :, 2])).float()
 
 
-def surroundings_of(shell: Shell, splats: Any, *, trained: bool) -> Callable[[Pinholes], Surroundings]:
-    """What cameras see: the splats where they are solid, the shell elsewhere."""
+def surroundings_of(shell: Shell, splats: TrainedSplats | None) -> Callable[[Pinholes], Surroundings]:
+    """What cameras see: the splats where they are solid (None before they are trained), the shell elsewhere."""
 
     def look(cameras: Pinholes) -> Surroundings:
         depth = shell_depth(shell, cameras)
-        if not trained:
+        if splats is None:
             return Surroundings(depth, None)
         rendered = render_geometry(splats, cameras.to("cpu", torch.float32))
         return Surroundings(torch.where(rendered.solid, rendered.depth, depth), rendered.rgb)

@@ -198,6 +198,12 @@ class FillerbusterSplatModel(SplatfactoModel):
         for name, value in state["strategy"].items():
             self.strategy_state[name] = value.to(self.device) if isinstance(value, Tensor) else value
 
+    @property
+    def room(self) -> int | None:
+        """Gaussians that the limit leaves room for; None without a limit."""
+        limit = self.config.max_gaussians
+        return None if limit is None else max(limit - self.num_points, 0)
+
     @torch.no_grad()
     def add_gaussians(self, points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], optimizers: Optimizers) -> int:
         """Append Gaussians at world ``points`` with ``colors`` in [0, 1] during training; returns how many were added.
@@ -214,9 +220,7 @@ class FillerbusterSplatModel(SplatfactoModel):
             )
         if not bool(points.isfinite().all() and colors.isfinite().all()):
             raise ValueError("points and colors: expected finite values, got NaN or infinity; drop those points first")
-        limit = self.config.max_gaussians
-        room = len(points) if limit is None else max(limit - self.num_points, 0)
-        chosen = evenly_chosen(len(points), room).to(points.device)
+        chosen = evenly_chosen(len(points), len(points) if self.room is None else self.room).to(points.device)
         if len(chosen) == 0:
             return 0
         points, colors = points[chosen].to(self.means), colors[chosen].to(self.means)

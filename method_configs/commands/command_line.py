@@ -26,6 +26,7 @@ from method_configs.benchmarks.methods import Methods
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
+from method_configs.commands.train_options import TrainOptions
 from method_configs.evaluations.ablations import Ablations
 from method_configs.evaluations.conditioning import Conditioning
 from method_configs.evaluations.consistency import Consistency
@@ -72,63 +73,18 @@ def train(
     /,
     *,
     output: Path,
-    stage: Literal["all", "image-vae", "raymap-vae", "dit"] = "all",
-    steps: int | None = None,
-    minutes: float | None = None,
-    device: str | None = None,
-    half: bool = True,
-    precision: Literal["auto", "float32", "bfloat16"] | None = None,
-    accumulate: int | None = None,
-    recompute: bool = False,
-    shard: bool = False,
-    sheet_every: int | None = None,
-    keep: int | None = None,
-    tensorboard: bool = False,
-    dry_run: bool = False,
-    captures: Path | None = None,
-    meshes: Path | None = None,
-    images: str | None = None,
-    rooms: bool = False,
-    text_encoder: Path | None = None,
-    lpips: Path | None = None,
-    start_from: Path | None = None,
+    training: tyro.conf.OmitArgPrefixes[TrainOptions] = TrainOptions(),
 ) -> None:
     """Train a model; the same command again goes on where the last one ended. Under torchrun on many devices.
 
     Args:
         preset: What to train, e.g. rooms-tiny (the bundled model).
         output: Folder of the training; the finished model is its subfolder "model".
-        stage: One stage, or all three in turn.
-        steps: Steps per stage instead of the preset's.
-        minutes: Stop after so many minutes; a transformer that is not done by then is exported as it is.
-        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
-        half: Store the model in half precision (the raymap autoencoder never is).
-        precision: Of matrix products and convolutions instead of the preset's (auto: bfloat16 where it is faster);
-            weights stay float32.
-        accumulate: Parts that each process does its share of a batch in, one after the other, to save memory.
-        recompute: Keep no activations inside blocks, to save memory for a third more time.
-        shard: Spread the transformer's weights over the processes (FSDP).
-        sheet_every: Steps between sample sheets of an unseen room.
-        keep: Checkpoints kept.
-        tensorboard: Also write TensorBoard's files.
-        dry_run: Only say sizes, memory and speed of the stages here, measured in a few steps; nothing is written.
-        captures: Folder with captures at any depth (each with a transforms.json) to learn from instead of rooms.
-        meshes: Folder with mesh files at any depth to learn from instead of rooms.
-        images: WebDataset shards of captioned pictures: a folder, or a pattern such as URL/{0000..9999}.tar.
-        rooms: Procedural rooms beside captures and meshes.
-        text_encoder: Clone of openai/clip-vit-large-patch14, for presets that read text.
-        lpips: Weights of SqueezeNet 1.1 as torchvision stores them, for the image autoencoder's perceptual loss.
-        start_from: Model folder whose weights the training begins with; its autoencoders are kept as they are.
+        training: What is asked for instead of what the preset says.
     """
     from method_configs.commands.training import train_preset
 
-    train_preset(
-        preset, output, stage=stage, steps=steps, minutes=minutes, device=device, half=half, precision=precision,
-        accumulate=accumulate,
-        recompute=recompute, shard=shard, sheet_every=sheet_every, keep=keep, tensorboard=tensorboard, dry_run=dry_run,
-        captures=captures,
-        meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips, start_from=start_from,
-    )  # fmt: skip
+    train_preset(preset, output, training)
 
 
 def convert(

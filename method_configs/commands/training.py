@@ -15,19 +15,19 @@ import math
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
-from fb_core.data.training.folders import TrainingData
-from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
 from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import Group, joined
 from fb_core.training.run.loop import EngineConfig, OnProgress
 from fb_core.training.run.progress_log import ProgressLog
+from method_configs.commands.train_options import TrainOptions
 from method_configs.presets import PRESETS
 
 _logger = logging.getLogger(__name__)
@@ -35,89 +35,70 @@ _SECONDS_BETWEEN_LINES = 30.0
 GIB = 2**30
 
 
-def train_preset(
-    preset: str,
-    output: Path,
-    *,
-    stage: str = "all",
-    steps: int | None = None,
-    minutes: float | None = None,
-    device: str | None = None,
-    half: bool = True,
-    precision: str | None = None,
-    accumulate: int | None = None,
-    recompute: bool = False,
-    shard: bool = False,
-    sheet_every: int | None = None,
-    keep: int | None = None,
-    tensorboard: bool = False,
-    dry_run: bool = False,
-    captures: Path | None = None,
-    meshes: Path | None = None,
-    images: str | None = None,
-    rooms: bool = False,
-    text_encoder: Path | None = None,
-    lpips: Path | None = None,
-    start_from: Path | None = None,
-) -> Path | None:
+@dataclass(frozen=True, kw_only=True)
+class _Training:
+    """A training that is about to run: what, where, how, and with whom."""
+
+    recipe: Recipe
+    output: Path
+    options: TrainOptions
+    engine: EngineConfig
+    device: torch.device
+    group: Group
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        return STAGES if self.options.stage == "all" else (self.options.stage,)
+
+    def steps_of(self, stage: str) -> int:
+        """Steps that a stage is to have in all."""
+        return self.options.steps or _steps_planned(self.recipe, stage)
+
+    def say(self, message: str, *values: object) -> None:
+        if self.group.is_main:
+            _logger.info(message, *values)
+
+
+def train_preset(preset: str, output: Path, options: TrainOptions = TrainOptions()) -> Path | None:
     """Train what is not trained yet and export; returns the model's folder, or None while stages are missing.
 
     Stages end in order: when the time is up in one, those after it are not begun, because the transformer learns the
-    latents of finished autoencoders. Options of the engine that are None or False are the preset's. Under torchrun all
-    its processes train together. ``start_from`` is a model folder to begin with; its autoencoders are kept unless a
-    stage of theirs is named. The options from ``captures`` to ``lpips`` say where the data lie
-    (:class:`fb_core.data.training.folders.TrainingData`).
+    latents of finished autoencoders. Under torchrun all its processes train together. With ``options.start_from`` the
+    autoencoders of that model are kept unless a stage of theirs is named.
 
-    Raises ValueError for an unknown preset, stage or device, and for steps or minutes that are not positive. SystemExit
-    when a signal ended it, after a checkpoint.
+    Raises ValueError for an unknown preset or device, and for steps or minutes that are not positive. SystemExit when a
+    signal ended it, after a checkpoint.
     """
-    data = TrainingData(
-        captures=captures, meshes=meshes, images=images, rooms=rooms, text_encoder=text_encoder, lpips=lpips
-    )
-    recipe = dataclasses.replace(_recipe(preset), data=data, start_from=start_from)
-    _require_positive(steps=steps, minutes=minutes, accumulate=accumulate, keep=keep)
-    require_between("steps", steps or 1, 1, MOST_TRAINING_STEPS)
-    stages = STAGES if stage == "all" else (stage,)
-    chosen = {"precision": precision, "accumulate": accumulate, "keep": keep, "sheet_every": sheet_every}
-    flags = {"recompute": recompute, "shard": shard, "tensorboard": tensorboard}
-    changes = {name: value for name, value in chosen.items() if value is not None} | {
-        name: True for name, value in flags.items() if value
-    }
-    engine = dataclasses.replace(recipe.engine, **changes)
-    if not dry_run:
-        _require_own_model_or_free(output, start_from)  # before days of training, not after them
-    with joined(_device(device)) as (group, where):
-        if dry_run:
-            for name in stages:
-                _say(group, "%s", _told(name, measure(recipe, name, device=where, engine=engine, group=group)))
+    options.require_sensible()
+    recipe = dataclasses.replace(_recipe(preset), data=options.data, start_from=options.start_from)
+    engine = dataclasses.replace(recipe.engine, **options.engine_changes)
+    if not options.dry_run:
+        _require_own_model_or_free(output, options.start_from)  # before days of training, not after them
+    with joined(_device(options.device)) as (group, where):
+        training = _Training(recipe=recipe, output=output, options=options, engine=engine, device=where, group=group)
+        if options.dry_run:
+            for name in training.stages:
+                training.say(
+                    "%s", _cost_in_words(name, measure(recipe, name, device=where, engine=engine, group=group))
+                )
             return None
-        if stage == "all" and group.is_main:
+        if options.stage == "all" and group.is_main:
             adopt_autoencoders(recipe, output)
         group.wait()
-        if not _train_stages(
-            recipe, stages, output, where, steps, math.inf if minutes is None else minutes, engine, group
-        ):
+        if not _train_stages(training):
             return None
         if group.is_main:
-            export(recipe, output, output / "model", dtype=torch.float16 if half else torch.float32)
+            export(recipe, output, output / "model", dtype=torch.float16 if options.half else torch.float32)
         return output / "model"
 
 
-def _train_stages(
-    recipe: Recipe,
-    stages: tuple[str, ...],
-    output: Path,
-    device: torch.device,
-    steps: int | None,
-    minutes: float,
-    engine: EngineConfig,
-    group: Group,
-) -> bool:
+def _train_stages(training: _Training) -> bool:
     """Whether every stage has been trained, if only in part."""
-    until = time.monotonic() + 60 * minutes
-    for name in stages:
-        if _steps_done(output / name) >= (steps or _steps_planned(recipe, name)):
-            _say(group, "%s is trained already", name)
+    output, group = training.output, training.group
+    until = time.monotonic() + 60 * (math.inf if training.options.minutes is None else training.options.minutes)
+    for name in training.stages:
+        if _steps_done(output / name) >= training.steps_of(name):
+            training.say("%s is trained already", name)
             if group.is_main and not (output / name / "loss.png").exists():
                 ProgressLog(
                     output / name, name, from_step=_steps_done(output / name)
@@ -125,33 +106,35 @@ def _train_stages(
             continue
         if group.any(time.monotonic() >= until):
             break
-        left = (until - time.monotonic()) / 60
-        with _progress(name, group) as show:
-            run = run_stage(
-                recipe,
-                name,
-                output,
-                device=device,
-                steps=steps,
-                minutes=left,
-                on_progress=show,
-                engine=engine,
-                group=group,
-            )
-        if run.signal:
-            _say(group, "%s stopped by signal %d at step %d of %d, which is saved; the same command goes on from there",
-                 name, run.signal, run.step, run.config.steps)  # fmt: skip
-            sys.exit(128 + run.signal)
-        if run.step < run.config.steps:
-            _say(
-                group,
-                "%s stopped at step %d of %d; the same command goes on from there",
-                name,
-                run.step,
-                run.config.steps,
-            )
+        if not _train_stage(training, name, minutes=(until - time.monotonic()) / 60):
             break
     return all(_steps_done(output / name) for name in STAGES)
+
+
+def _train_stage(training: _Training, name: str, *, minutes: float) -> bool:
+    """Whether it was trained to its end. SystemExit when a signal ended it."""
+    with _progress(name, training.group) as show:
+        run = run_stage(
+            training.recipe,
+            name,
+            training.output,
+            device=training.device,
+            steps=training.options.steps,
+            minutes=minutes,
+            on_progress=show,
+            engine=training.engine,
+            group=training.group,
+        )
+    if run.signal:
+        training.say("%s stopped by signal %d at step %d of %d, which is saved; the same command goes on from there",
+                     name, run.signal, run.step, run.config.steps)  # fmt: skip
+        sys.exit(128 + run.signal)
+    if run.step < run.config.steps:
+        training.say(
+            "%s stopped at step %d of %d; the same command goes on from there", name, run.step, run.config.steps
+        )
+        return False
+    return True
 
 
 def _require_own_model_or_free(output: Path, start_from: Path | None) -> None:
@@ -191,12 +174,6 @@ def _steps_done(folder: Path) -> int:
     return read_state(path, mapped=True)["step"] if complete else 0
 
 
-def _require_positive(**values: float | None) -> None:
-    for name, value in values.items():
-        if value is not None and not value > 0:
-            raise ValueError(f"{name}: expected a positive number, got {value}")
-
-
 def _device(name: str | None) -> torch.device:
     """The device asked for, checked before any work; by default the first GPU, or the CPU where there is none."""
     if name is None:
@@ -210,12 +187,7 @@ def _device(name: str | None) -> torch.device:
     return device
 
 
-def _say(group: Group, message: str, *values: object) -> None:
-    if group.is_main:
-        _logger.info(message, *values)
-
-
-def _told(stage: str, cost: Cost) -> str:
+def _cost_in_words(stage: str, cost: Cost) -> str:
     """A stage's cost in one line."""
     sizes = ", ".join(f"{name} {count / 1e6:.1f} M" for name, count in cost.parameters.items())
     return (

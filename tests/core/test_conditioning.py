@@ -7,6 +7,7 @@ import torch
 
 from fb_core.conditioning import (
     Conditioning,
+    Encoding,
     assemble,
     encode_known,
     encode_null,
@@ -30,7 +31,13 @@ def vaes() -> tuple[VAE, VAE]:
 def encoded(vaes, images, image_known, rays, rays_known) -> Conditioning:
     with torch.no_grad():
         return encode_known(
-            images, image_known, rays, rays_known, image_vae=vaes[0], raymap_vae=vaes[1], views_at_once=2
+            images,
+            image_known,
+            rays,
+            rays_known,
+            image_vae=vaes[0],
+            raymap_vae=vaes[1],
+            encoding=Encoding(views_at_once=2),
         )
 
 

@@ -12,7 +12,7 @@ import torch
 from helpers.pretended_device import DEVICE, drawn, made_there, pretended
 from helpers.tiny_models import _SMALL_VAE
 
-from fb_core.conditioning import Conditioning, decode_in_chunks, encode_known, encode_null, split
+from fb_core.conditioning import Conditioning, Encoding, decode_in_chunks, encode_known, encode_null, split
 from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.sampling import SamplingConfig, noise_of, random_orders
@@ -46,7 +46,7 @@ def encoded(image_vae: VAE, raymap_vae: VAE, dit: DiT) -> tuple[Conditioning, Co
     mask = drawn(VIEWS, 1, SIDE, SIDE)
     vaes = {"image_vae": image_vae, "raymap_vae": raymap_vae}
     pictures, rays = drawn(VIEWS, 3, SIDE, SIDE), drawn(VIEWS, 6, SIDE, SIDE)
-    known = encode_known(pictures, mask, rays, mask, **vaes, views_at_once=3, transformer=dit.config)
+    known = encode_known(pictures, mask, rays, mask, **vaes, encoding=Encoding(views_at_once=3), transformer=dit.config)
     return known, encode_null(known, **vaes, pixels=(SIDE, SIDE))
 
 

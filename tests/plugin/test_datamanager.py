@@ -34,14 +34,8 @@ from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.data.capture.captures import validate_capture
 from fb_core.geometry.shell import sphere
 from fb_core.views import Views
-from fb_nerfstudio.capture.unseen import (
-    Rendered,
-    find_unseen,
-    surface_points,
-    unseen_gaussians,
-    with_matched_colors,
-    with_unseen_masks,
-)
+from fb_nerfstudio.capture.splat_renders import Rendered, surface_points
+from fb_nerfstudio.capture.unseen import find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
 
 
@@ -144,7 +138,7 @@ def test_a_memory_budget_reaches_the_sampler_and_what_does_not_fit_is_one_senten
     with pytest.raises(ValueError, match=r"completion\.memory_budget"):
         options(memory_budget=0.0)
 
-    def too_small(self, views, *, generator, sampling, on_step=None):
+    def too_small(self, views, *, sampling, **_):
         raise ValueError(f"memory budget of {sampling.memory_budget_bytes} bytes: too small; 4 views would fit")
 
     monkeypatch.setattr(GreyFiller, "complete", too_small)
@@ -178,7 +172,7 @@ def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(t
     masks = torch.zeros_like(bank.masks)
     masks[0] = True
     masks[1, : masks.shape[1] // 2] = True
-    manager._set_bank(dataclasses.replace(bank, masks=masks))
+    manager.generation.set_views(dataclasses.replace(bank, masks=masks))
     assert manager.generated_probability == pytest.approx(1.5 / (1.5 + 6))
     covered = [
         float(batch["mask"].float().mean())
@@ -590,7 +584,7 @@ def test_a_saved_run_is_drawn_whether_the_viewer_comes_first_or_last(tiny_captur
         if not viewer_first:  # ns-viewer
             manager.completion_panel._setup(viewer)
         assert len([name for name in viewer.viser_server.nodes if "view_" in name]) == 6
-        manager._set_bank(None)
+        manager.generation.set_views(None)
         assert viewer.viser_server.nodes == {}
 
 

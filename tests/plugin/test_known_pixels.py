@@ -20,8 +20,9 @@ from fb_core.data.capture.captures import read_capture
 from fb_core.geometry.shell import sphere
 from fb_core.geometry.viewpoints.paths import seen_by
 from fb_core.splatting import photometric
+from fb_nerfstudio.capture.splat_renders import Rendered
 from fb_nerfstudio.capture.start_points import start_points
-from fb_nerfstudio.capture.unseen import Rendered, coarse_mask, find_unseen, seen_by_nobody_else
+from fb_nerfstudio.capture.unseen import coarse_mask, find_unseen, seen_by_nobody_else
 from fb_nerfstudio.runs.export import write_export
 from fb_nerfstudio.runs.saved_run import CompletedCapture
 

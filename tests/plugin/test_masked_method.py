@@ -28,7 +28,7 @@ from fb_core.data.capture.captures import validate_capture
 from fb_nerfstudio.datamanager import FillerbusterDataManager, Refused
 
 MASKED = [1, 3, 5]  # of the tiny capture's six pictures
-LOAD = FillerbusterDataManager._load_inpainter
+LOAD = FillerbusterDataManager.load_inpainter
 
 
 def inpainting(dilate: int = 1, **changes) -> CompletionConfig:
@@ -89,9 +89,9 @@ def test_nothing_to_inpaint_in_the_chosen_pictures_is_one_sentence(tiny_capture:
 
 
 def test_the_grid_inpainter_is_chosen_and_runs(tiny_capture: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(FillerbusterDataManager, "_load_inpainter", LOAD)
+    monkeypatch.setattr(FillerbusterDataManager, "load_inpainter", LOAD)
     manager = make(tiny_capture, inpainting(inpainter="grid", image_size=32))
-    assert isinstance(manager._load_inpainter(), GridInpainter)
+    assert isinstance(manager.load_inpainter(), GridInpainter)
     generated(manager)
     bank = manager.generated_views
     assert len(bank) == 3 and bank.origins[0].model_hash == GridInpainter.of(None, "cpu").model_hash

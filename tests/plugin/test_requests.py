@@ -48,6 +48,7 @@ from fb_core.data.capture.captures import validate_capture
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import sphere
 from fb_nerfstudio.capture.unseen import seen_by_nobody_else
+from fb_nerfstudio.generation.scene import TrainedScene
 
 _ = stand_in_model  # no test here loads real weights either
 
@@ -318,7 +319,7 @@ def test_requested_views_join_the_bank_the_checkpoint_and_the_folder(tiny_captur
     )
 
 
-def test_requested_views_are_masked_and_seeded_in_holes_only(tiny_capture: Path):
+def test_requested_views_are_masked_and_seeded_in_holes_only(tiny_capture: Path, monkeypatch: pytest.MonkeyPatch):
     manager = make(tiny_capture)
     attrs = generated(manager, step=150)
     added = len(attrs.pipeline.model.added)
@@ -337,7 +338,7 @@ def test_requested_views_are_masked_and_seeded_in_holes_only(tiny_capture: Path)
         "rgb": torch.full((16, 16, 3), 0.5),
     }
     manager.completion_panel.requests.put(RegenerateRound(number=2, seed=9))
-    manager._seen_points = lambda *args: None
+    monkeypatch.setattr(TrainedScene, "seen_points", lambda *_: None)
     run_callbacks(manager, attrs, 152)
     assert len(attrs.pipeline.model.added) == added + 1 and manager.generated_views.origins[6].seed == 9
 

@@ -9,10 +9,9 @@ from helpers.scenes.completions import room_cameras
 
 from fb_core.flow import at_time
 from fb_core.geometry.cameras import Pinholes
-from fb_core.inpainter import _counting
 from fb_core.sampling.integration.trajectory import integrate
 from fb_core.sampling.options import SamplingConfig
-from fb_core.sampling.starts import imposed
+from fb_core.sampling.starts import imposed, joining
 from fb_core.views import Views
 from fb_nerfstudio.generation.first_guess import first_guess
 
@@ -63,10 +62,10 @@ def test_the_least_known_pixel_of_a_latent_decides() -> None:
     current.image_known[:, :, :8, :8] = 0.6
     current.image_known[:, :, 3, 12] = 0.3
     current.image_known[:, :, 8, 0] = 0.0
-    counts = _counting(current, Views.unknown(camera(16)))
+    counts = joining(current, Views.unknown(camera(16)))
     assert counts is not None and counts[0, 0].tolist() == [[0.5, 0.25], [0.0, 1.0]]
     assert bool((counts[:, 16:] == 1).all()), "rays are known"
-    assert _counting(views(0.1), Views.unknown(camera(16))) is None, "too little to begin from"
+    assert joining(views(0.1), Views.unknown(camera(16))) is None, "too little to begin from"
 
 
 def test_half_opaque_splats_are_half_a_start() -> None:

@@ -20,6 +20,9 @@ from helpers.tiny_models import save_tiny_model
 from fb_core.data.rooms.room_captures import rooms
 from fb_nerfstudio.checks import run_folder
 from fb_nerfstudio.datamanager import FillerbusterDataManager
+from fb_nerfstudio.generation import due_rounds
+from fb_nerfstudio.generation.generation import Generation
+from fb_nerfstudio.generation.scene import TrainedScene
 from fb_nerfstudio.trainer import FillerbusterTrainer
 
 AT_STEP, STEPS = 3, 6
@@ -90,38 +93,38 @@ def in_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def just_before_the_generation(monkeypatch: pytest.MonkeyPatch) -> None:
     """A moment in which it is noted, as in every step: the generation does not begin."""
-    due = FillerbusterDataManager._complete_when_due
+    due = FillerbusterDataManager.complete_when_due
 
     def complete_when_due(self: FillerbusterDataManager, attributes: Any, step: int) -> None:
         if step == AT_STEP:
             interrupt()
-            monkeypatch.setattr(FillerbusterDataManager, "_complete", lambda *_: pytest.fail("it generates"))
+            monkeypatch.setattr(due_rounds, "complete", lambda *_: pytest.fail("it generates"))
         due(self, attributes, step)
 
-    monkeypatch.setattr(FillerbusterDataManager, "_complete_when_due", complete_when_due)
+    monkeypatch.setattr(FillerbusterDataManager, "complete_when_due", complete_when_due)
 
 
 def in_the_generation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before its first round; what was trained until then is saved."""
-    plan = FillerbusterDataManager._seen_points
+    plan = TrainedScene.seen_points
 
-    def seen_points(self: FillerbusterDataManager, *arguments: Any) -> Any:
+    def seen_points(self: TrainedScene, *arguments: Any) -> Any:
         interrupt()
         return plan(self, *arguments)
 
-    monkeypatch.setattr(FillerbusterDataManager, "_seen_points", seen_points)
+    monkeypatch.setattr(TrainedScene, "seen_points", seen_points)
 
 
 def while_gaussians_are_placed(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the rounds: they are kept, and no Gaussian is placed twice."""
-    fit = FillerbusterDataManager._fitted_in
+    fit = Generation.fitted_in
 
-    def fitted_in(self: FillerbusterDataManager, *arguments: Any, **options: Any) -> Any:
+    def fitted_in(self: Generation, *arguments: Any, **options: Any) -> Any:
         done = fit(self, *arguments, **options)
         interrupt()
         return done
 
-    monkeypatch.setattr(FillerbusterDataManager, "_fitted_in", fitted_in)
+    monkeypatch.setattr(Generation, "fitted_in", fitted_in)
 
 
 MOMENTS: dict[Callable[[pytest.MonkeyPatch], None], int] = {

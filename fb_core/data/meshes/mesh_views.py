@@ -1,8 +1,7 @@
 """Training sequences from meshes: views on a sphere around any file that trimesh reads (paper, appendix
 "Shutterstock3D").
 
-Our triangle caster draws them, on the training's device, with the mesh's own colours or texture under soft light;
-pyvista can draw them instead, which knows more materials.
+Our triangle caster draws them, on the training's device, with the mesh's own colours or texture under soft light.
 """
 
 from __future__ import annotations
@@ -11,12 +10,11 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
 
-from fb_core.data.meshes.mesh_pictures import Lighting, draw_with_caster, draw_with_pyvista, read_mesh
+from fb_core.data.meshes.mesh_pictures import Lighting, draw_with_caster, read_mesh
 from fb_core.data.training.sequences import Encode, Rendered, ViewPool
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
@@ -24,6 +22,9 @@ from fb_core.sampling.randomness import generator_of
 
 _logger = logging.getLogger(__name__)
 _SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf", ".dae", ".zae")
+_FOV_DEGREES = 50.0
+_DISTANCE = 2.6, 3.4  # range of the cameras' distance from the middle, in radii of the mesh
+_TRIES = 8  # files, one after the other, before an unreadable mesh ends the training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,27 +39,12 @@ class MeshConfig:
     """Rendered meshes at hand."""
     renewed_per_step: float = 0.25
     """Meshes replaced per training step."""
-    fov_degrees: float = 50.0
-    """Field of view of the cameras."""
-    distance: tuple[float, float] = (2.6, 3.4)
-    """Range of the cameras' distance from the middle, in radii of the mesh."""
     supersample: int = 2
     """Rays per pixel side."""
-    renderer: Literal["caster", "pyvista"] = "caster"
-    """Who draws."""
-    retries: int = 8
-    """Files tried, one after the other, before an unreadable mesh ends the training."""
 
     def __post_init__(self) -> None:
-        if (
-            self.image_size % 16
-            or min(self.views, self.meshes, self.supersample, self.retries) < 1
-            or self.distance[0] <= 1.0
-        ):
-            raise ValueError(
-                "meshes: expected an image size divisible by 16, counts of at least 1 and distances above 1, got "
-                f"{self}"
-            )
+        if self.image_size % 16 or min(self.views, self.meshes, self.supersample) < 1:
+            raise ValueError(f"meshes: expected an image size divisible by 16 and counts of at least 1, got {self}")
 
 
 class MeshPool(ViewPool):
@@ -96,25 +82,21 @@ class MeshPool(ViewPool):
         cameras = sphere_cameras(self.config, generator)
         if not self.with_images:
             return Rendered(cameras)
-        draw = draw_with_pyvista if self.config.renderer == "pyvista" else draw_with_caster
         background, lamp = torch.rand(3, generator=generator), F.normalize(torch.randn(3, generator=generator), dim=0)
         light = Lighting(background=tuple(background.tolist()), lamp=tuple(lamp.tolist()))
         error: Exception | None = None
-        for _ in range(self.config.retries):
+        for _ in range(_TRIES):
             path = self.files[int(torch.randint(len(self.files), (), generator=generator))]
             try:
-                return Rendered(
-                    cameras, draw(read_mesh(path), cameras.to(self.device), light, supersample=self.config.supersample)
-                )
+                there, supersample = cameras.to(self.device), self.config.supersample
+                return Rendered(cameras, draw_with_caster(read_mesh(path), there, light, supersample=supersample))
             except (
                 Exception
             ) as found:  # of trimesh and of what its materials hold: whatever it is, another file is drawn
                 told = found if isinstance(found, ValueError) else f"{path}: {type(found).__name__}: {found}"
                 _logger.warning("left out a mesh: %s", told)
                 error = found
-        raise ValueError(
-            f"meshes: {self.config.retries} files in a row could not be drawn, the last because: {error}"
-        ) from error
+        raise ValueError(f"meshes: {_TRIES} files in a row could not be drawn, the last because: {error}") from error
 
 
 def find_meshes(folder: Path) -> list[Path]:
@@ -132,8 +114,8 @@ def find_meshes(folder: Path) -> list[Path]:
 def sphere_cameras(config: MeshConfig, generator: torch.Generator) -> Pinholes:
     """Upright cameras all over a sphere that look at its middle, where the mesh has radius 1."""
     ways = F.normalize(torch.randn(config.views, 3, generator=generator), dim=-1)
-    near, far = config.distance
+    near, far = _DISTANCE
     distances = near + (far - near) * torch.rand(config.views, 1, generator=generator)
     up = torch.tensor([0.0, 0.0, 1.0])
     size, middle = config.image_size, torch.zeros(config.views, 3)
-    return Pinholes.looking_at(ways * distances, middle, up=up, fov_degrees=config.fov_degrees, width=size, height=size)
+    return Pinholes.looking_at(ways * distances, middle, up=up, fov_degrees=_FOV_DEGREES, width=size, height=size)

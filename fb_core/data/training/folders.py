@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -14,32 +12,13 @@ from fb_core.data.meshes.mesh_views import MeshConfig, MeshPool, find_meshes
 from fb_core.data.training.captioned_images import CaptionedConfig, CaptionedImages
 from fb_core.data.training.capture_sequences import CaptureConfig, CaptureSource, find_captures
 from fb_core.data.training.mixed_sources import Alternating, AnyOf, InTurn, Later, SeveralPerRow, turn
+from fb_core.data.training.named_data import TrainingData
 from fb_core.data.training.sequences import Encode, PoolConfig, RoomPool
 from fb_core.data.training.task import Source
 from fb_core.sampling.randomness import mixed
 
 _logger = logging.getLogger(__name__)
 _SOURCES = 101  # streams of a seed that the choice of resolutions does not share
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingData:
-    """Where data lie. Without captures and meshes, procedural rooms are the multi-view data."""
-
-    captures: Path | None = None
-    """Folder with captures at any depth (each has a transforms.json)."""
-    meshes: Path | None = None
-    """Folder with mesh files at any depth."""
-    images: str | None = None
-    """WebDataset shards of captioned pictures: a folder, or a pattern such as URL/{0000..9999}.tar."""
-    rooms: bool = False
-    """Procedural rooms beside captures and meshes."""
-    mesh_renderer: str = "caster"
-    """Who draws meshes: caster (ours) or pyvista."""
-    text_encoder: Path | None = None
-    """Clone of openai/clip-vit-large-patch14, for presets that read text."""
-    lpips: Path | None = None
-    """torchvision's file of SqueezeNet 1.1, for the perceptual term of the image autoencoder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +51,7 @@ def multi_view_source(
             CaptureSource(find_captures(data.captures), CaptureConfig(image_size=pool.image_size), device=device)
         )
     if data.meshes is not None:
-        renderer: Any = data.mesh_renderer  # MeshConfig says which there are
-        config = MeshConfig(image_size=pool.image_size, renderer=renderer, supersample=pool.supersample)
+        config = MeshConfig(image_size=pool.image_size, supersample=pool.supersample)
         sources.append(
             MeshPool(find_meshes(data.meshes), config, seed=seed, device=device, encode=encode, with_images=with_images)
         )

@@ -30,7 +30,8 @@ from fb_core.masks import grow_hole, partly_known, resampled, wholly_known
 from fb_core.registration.by_raymaps import Square
 from fb_core.sampling.options import SamplingConfig
 from fb_core.views import Views
-from fb_nerfstudio.capture.unseen import Rendered, Unseen, with_matched_colors
+from fb_nerfstudio.capture.splat_renders import Rendered
+from fb_nerfstudio.capture.unseen import Unseen, with_matched_colors
 
 COLOUR = torch.tensor([0.2, 0.7, 0.4])
 LOUD = torch.tensor([1.0, 0.0, 1.0])

@@ -30,6 +30,7 @@ from fb_core.networks.weights import require_plain
 from fb_core.sampling.options import SamplingConfig
 from fb_core.training.run.loop import LoopConfig
 from method_configs.commands.complete.options import CompleteOptions
+from method_configs.commands.train_options import TrainOptions
 
 SECONDS = 3.0
 
@@ -361,10 +362,13 @@ def test_options_beyond_all_use(name: str):
     assert "expected" in sentence
 
 
-def test_training_steps_on_the_command_line(tmp_path: Path):
-    from method_configs.commands.training import train_preset
+def test_training_steps_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    from method_configs.commands.command_line import main
 
-    assert "steps: expected" in refused(lambda: train_preset("rooms-tiny", tmp_path / "out", steps=10**15))
+    assert "steps: expected" in refused(lambda: TrainOptions(steps=10**15).require_sensible())
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "rooms-tiny", "--output", str(tmp_path / "out"), "--steps", str(10**15)])
+    assert ended.value.code == 1 and "Error: steps: expected" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

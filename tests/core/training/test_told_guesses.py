@@ -17,6 +17,7 @@ from fb_core.networks.vae import VAE
 from fb_core.sampling.options import SamplingConfig
 from fb_core.training.recipe import Recipe, adopt_autoencoders, dit_stage, export, run_stage
 from fb_core.views import Views
+from method_configs.commands.train_options import TrainOptions
 from method_configs.commands.training import train_preset
 
 NEW = dataclasses.replace(
@@ -104,7 +105,7 @@ def test_a_training_starts_from_a_model_and_keeps_its_autoencoders(trained, tmp_
 
 def test_another_architecture_is_no_start(trained, tmp_path):
     with pytest.raises(ValueError, match=r"model"):
-        train_preset("rooms-tiny", tmp_path, start_from=trained / "model", steps=1)
+        train_preset("rooms-tiny", tmp_path, TrainOptions(start_from=trained / "model", steps=1))
     assert not any(tmp_path.rglob("*.pt"))
 
 

@@ -15,8 +15,8 @@ from fb_core.completion.results.completed_views import CompletedViews, Origin
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
-from fb_nerfstudio import datamanager
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig
+from fb_nerfstudio.generation import surroundings
 
 
 class GreyFiller:
@@ -26,7 +26,9 @@ class GreyFiller:
 
     recommended_sampling = SamplingConfig()
 
-    def complete(self, views, *, generator, sampling=SamplingConfig(), on_step=None, current=None) -> Views:
+    def complete(
+        self, views, *, generator, sampling=SamplingConfig(), on_step=None, prompt=None, current=None
+    ) -> Views:
         GreyFiller.calls += 1
         if on_step is not None:
             on_step(1, 1)
@@ -41,10 +43,12 @@ class GreyFiller:
 class ToySplats(torch.nn.Module):
     """A stand-in for the splat model: sees a wall at depth 2 in the left half of every picture."""
 
-    device = torch.device("cpu")
+    device, room = torch.device("cpu"), None
 
     def __init__(self) -> None:
         super().__init__()
+        self.means = torch.zeros(0, 3)
+        self.gauss_params, self.strategy_state, self.info = {}, {}, {}
         self.added: list[tuple[torch.Tensor, torch.Tensor]] = []
         self.modes: list[bool] = []
 
@@ -62,6 +66,9 @@ class ToySplats(torch.nn.Module):
     def add_gaussians(self, points, colors, optimizers) -> int:
         self.added.append((points, colors))
         return len(points)
+
+    def remove_gaussians(self, chosen, optimizers) -> int:
+        return 0
 
 
 class ToyTrainer:
@@ -89,11 +96,10 @@ def stand_in_model(monkeypatch):
         GreyFiller.loads += 1
         return GreyFiller()
 
-    monkeypatch.setattr(FillerbusterDataManager, "_load_inpainter", load)
-    monkeypatch.setattr(FillerbusterDataManager, "_check_inpainter", lambda self: None)
-    monkeypatch.setattr(
-        datamanager, "release_memory", lambda: None
-    )  # nothing large here, and each time takes half a second
+    monkeypatch.setattr(FillerbusterDataManager, "load_inpainter", load)
+    monkeypatch.setattr(FillerbusterDataManager, "check_inpainter", lambda self: None)
+    # Nothing large is here, and each time takes half a second.
+    monkeypatch.setattr(surroundings, "release_memory", lambda: None)
 
 
 def options(**changes) -> CompletionConfig:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,6 +12,7 @@ import torch
 from helpers.folders.runs import make_run
 from helpers.plugin.datamanagers import GreyFiller, attributes, draws, run_callbacks
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.completion.brought_views import brought_views
 from fb_core.completion.options import CompletionConfig
@@ -21,9 +21,9 @@ from fb_core.completion.results.completed_views import BROUGHT, round_title
 from fb_core.data.capture.captures import FrameToWrite, read_capture, split_lists, write_capture, write_transforms
 from fb_core.files.faults import Refused
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio import datamanager
 from fb_nerfstudio.capture.dataparser import without_open3d
 from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig
+from fb_nerfstudio.generation import surroundings
 from method_configs.commands import command_line as commands
 
 PHOTOS, GENERATED = 9, 2
@@ -39,18 +39,16 @@ def stand_in_model(monkeypatch: pytest.MonkeyPatch):
         GreyFiller.loads += 1
         return GreyFiller()
 
-    monkeypatch.setattr(FillerbusterDataManager, "_load_inpainter", load)
-    monkeypatch.setattr(FillerbusterDataManager, "_check_inpainter", lambda self: None)
-    monkeypatch.setattr(datamanager, "release_memory", lambda: None)
+    monkeypatch.setattr(FillerbusterDataManager, "load_inpainter", load)
+    monkeypatch.setattr(FillerbusterDataManager, "check_inpainter", lambda self: None)
+    monkeypatch.setattr(surroundings, "release_memory", lambda: None)
 
 
 @pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What a person reads in the terminal."""
     lines: list[str] = []
-    monkeypatch.setattr(
-        datamanager, "CONSOLE", SimpleNamespace(print=lambda line, **_: lines.append(line), is_terminal=False)
-    )
+    monkeypatch.setattr(CONSOLE, "print", lambda line, **_: lines.append(line))
     return lines
 
 
@@ -150,9 +148,9 @@ def test_their_cameras_stand_where_nerfstudio_puts_them(capture: Path):
     manager = make(capture)
     run_callbacks(manager, attributes(manager))
     assert [Path(name).stem for name in stock.image_filenames[:2]] == ["generated_0000", "generated_0001"]
-    assert torch.equal(manager._bank.cameras.camera_to_worlds, stock.cameras.camera_to_worlds[:2])
+    assert torch.equal(manager.generation.bank.cameras.camera_to_worlds, stock.cameras.camera_to_worlds[:2])
     assert torch.equal(manager.train_dataset.cameras.camera_to_worlds, stock.cameras.camera_to_worlds[2:])
-    assert manager._bank.cameras.fx[0].item() == pytest.approx(stock.cameras.fx[0].item())
+    assert manager.generation.bank.cameras.fx[0].item() == pytest.approx(stock.cameras.fx[0].item())
 
 
 def test_what_the_photos_show_is_left_to_them(capture: Path):

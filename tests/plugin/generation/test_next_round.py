@@ -20,8 +20,9 @@ from fb_core.completion.planning.plan import CompletionPlan, Former, plan_comple
 from fb_core.completion.trust import Trust
 from fb_core.files.json_files import read_json
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.generation.fitting_in import _room
+from fb_nerfstudio.generation.fitting_in import most_seeds
 from fb_nerfstudio.generation.next_round import Rounds, due_after, former_of, in_turn
+from fb_nerfstudio.splats.splat_model import FillerbusterSplatModel
 
 __all__ = ["stand_in_model"]  # no test here loads real weights
 
@@ -104,9 +105,9 @@ def test_rounds_survive_a_checkpoint_and_runs_of_earlier_versions_have_had_their
 
 @pytest.mark.parametrize(("trust", "shown"), [(0.05, False), (0.5, True)])
 def test_only_believed_pixels_of_former_views_count_as_seen(trust: float, shown: bool) -> None:
-    former = former_of(views_of(trust), None, 1, trained=False)
+    former = former_of(views_of(trust), None, 1)
     assert len(former.cameras) == len(former.shown) == 3 and all(bool((mask == shown).all()) for mask in former.shown)
-    assert former_of(None, None, 1, trained=False).cameras == ()
+    assert former_of(None, None, 1).cameras == ()
 
 
 # ---- in a training --------------------------------------------------------------------------------------------------
@@ -172,5 +173,6 @@ def test_the_run_s_report_tells_trust_rounds_and_views(tiny_capture, tmp_path) -
     [(None, 10, 500, 500), (100, 60, 500, 20), (100, 60, 7, 7), (100, 100, 9, 0), (100, 120, 9, 0)],
 )
 def test_generated_gaussians_leave_half_of_what_the_cap_leaves_to_the_capture(cap, there, most, room) -> None:
-    assert _room(SimpleNamespace(config=SimpleNamespace(max_gaussians=cap), num_points=there), most) == room
-    assert _room(SimpleNamespace(), most) == most
+    model = SimpleNamespace(config=SimpleNamespace(max_gaussians=cap), num_points=there)
+    free = FillerbusterSplatModel.room.fget(model)
+    assert free == (None if cap is None else max(cap - there, 0)) and most_seeds(most, free) == room

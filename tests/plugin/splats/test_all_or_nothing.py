@@ -29,8 +29,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from fb_core.completion.requests import RegenerateRound, RemoveView, RequestQueue, key_of
 from fb_core.completion.results.completed_views import ANCHOR
 from fb_core.data import media
-from fb_nerfstudio import datamanager as datamanager_module
 from fb_nerfstudio.datamanager import FillerbusterDataManager
+from fb_nerfstudio.generation import due_rounds, generation
 from fb_nerfstudio.generation.bank import Bank
 from fb_nerfstudio.splats.all_or_nothing import undone_on_error
 
@@ -125,7 +125,7 @@ def of_fitting_in(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(datamanager_module, "fitted_in", fail)
+    monkeypatch.setattr(generation, "fitted_in", fail)
 
 
 REQUESTS = {
@@ -286,9 +286,7 @@ def test_the_manager_keeps_what_was_trained_before_it_generates(tiny_capture: Pa
     manager: FillerbusterDataManager = make(tiny_capture, options(at_step=2))
     order: list[str] = []
     monkeypatch.setattr(ToyTrainer, "generation_begins", lambda self: order.append("kept"), raising=False)
-    monkeypatch.setattr(
-        FillerbusterDataManager, "_complete", lambda self, *_: order.append(f"generated, at work: {self.at_work}")
-    )
+    monkeypatch.setattr(due_rounds, "complete", lambda *_: order.append(f"generated, at work: {manager.at_work}"))
     attrs = generated(manager, tmp_path, step=1)
     run_callbacks(manager, attrs, 2)
     assert order == ["kept", "generated, at work: True"] and not manager.at_work

@@ -32,8 +32,9 @@ from fb_core.data.training.capture_sequences import (
     read_training_capture,
     strided,
 )
-from fb_core.data.training.folders import Resolution, TrainingData, at_resolutions, multi_view_source, resolution_of
+from fb_core.data.training.folders import Resolution, at_resolutions, multi_view_source, resolution_of
 from fb_core.data.training.mixed_sources import Alternating, AnyOf, Later, SeveralPerRow
+from fb_core.data.training.named_data import TrainingData
 from fb_core.data.training.sequences import PoolConfig, RoomPool
 from fb_core.data.training.task import Source, TaskConfig
 from fb_core.sampling.randomness import generator_of

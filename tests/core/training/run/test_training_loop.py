@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import inspect
 import json
 import os
 import signal
@@ -20,6 +19,7 @@ import pytest
 import torch
 from helpers.tiny_training import LOOP, TOY, TinyStage, losses_of, run_in
 
+from fb_core.data.training.named_data import TrainingData
 from fb_core.networks.transformer.dit import DiT
 from fb_core.training import dry_run
 from fb_core.training.recipe import make_sheet, make_stage
@@ -27,6 +27,7 @@ from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import ALONE
 from fb_core.training.run.loop import EngineConfig, LoopConfig, Run, Stage
 from fb_core.training.run.progress_log import ProgressLog
+from method_configs.commands.train_options import TrainOptions
 
 ROOT = Path(__file__).resolve().parents[4]
 SHORT = dataclasses.replace(LOOP, steps=6, save_every=2)
@@ -242,7 +243,7 @@ def test_a_signal_saves_and_ends_with_a_message_and_its_number(tmp_path, monkeyp
 
     monkeypatch.setattr(training_command, "_progress", progress)
     with caplog.at_level("INFO"), pytest.raises(SystemExit) as stopped:
-        training_command.train_preset("toy", tmp_path, device="cpu", stage="raymap-vae")
+        training_command.train_preset("toy", tmp_path, TrainOptions(device="cpu", stage="raymap-vae"))
     assert stopped.value.code == 128 + signal.SIGTERM
     assert "raymap-vae stopped by signal 15 at step 1 of 4, which is saved" in caplog.text
     assert torch.load(tmp_path / "raymap-vae" / "checkpoint.pt", weights_only=True)["step"] == 1
@@ -278,24 +279,32 @@ train.main(["toy", "--output", {str(tmp_path)!r}, *options])
 
 
 def test_the_entrance_without_tyro_has_the_options_of_the_command():
-    from method_configs.commands.command_line import train as command
-    from method_configs.commands.training import train_preset
-    from method_configs.train import parser
+    """Both give the same options for the same words, whatever is asked for."""
+    import tyro
 
-    expected, real = (inspect.signature(function).parameters for function in (command, train_preset))
-    assert {name: one.default for name, one in expected.items()} == {name: one.default for name, one in real.items()}
-    parsed = parser().parse_args(
-        ["toy", "--output", "there", "--steps", "3", "--minutes", "0.5", "--no-half", "--dry-run"]
-    )
-    assert vars(parsed).keys() == real.keys()
-    assert (parsed.output, parsed.steps, parsed.minutes, parsed.half, parsed.dry_run, parsed.shard) == (
-        Path("there"),
-        3,
-        0.5,
-        False,
-        True,
-        False,
-    )
+    from method_configs.commands.command_line import train as command
+    from method_configs.train import options_of, parser
+
+    own = [field.name for field in dataclasses.fields(TrainOptions) if field.name != "data"]
+    names = [*own, *(field.name for field in dataclasses.fields(TrainingData))]
+    words = {"stage": "dit", "precision": "auto", "steps": "3", "minutes": "0.5", "accumulate": "2", "keep": "4"}
+    words |= {"sheet_every": "7"}
+    given = ["toy", "--output", "there"]
+    for name in names:
+        default = getattr(TrainOptions(), name, False) if name in own else getattr(TrainingData(), name)
+        flag = name.replace("_", "-")
+        given += [f"--{'no-' if default else ''}{flag}"] if isinstance(default, bool) else [f"--{flag}"]
+        given += [] if isinstance(default, bool) else [words.get(name, "place")]
+    parsed = options_of(parser().parse_args(given))
+    read: list[object] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("method_configs.commands.training.train_preset", lambda *told: read.extend(told))
+        tyro.extras.subcommand_cli_from_dict({"train": command, "other": command}, args=["train", *given])
+    assert read == ["toy", Path("there"), parsed]
+    assert (parsed.steps, parsed.half, parsed.stage, parsed.data.meshes) == (3, False, "dit", Path("place"))
+    defaults = TrainOptions()
+    assert all(getattr(parsed, name) != getattr(defaults, name) for name in own)
+    assert options_of(parser().parse_args(["toy", "--output", "there"])) == defaults
 
 
 def test_a_dry_run_tells_what_a_stage_costs_and_writes_nothing(tmp_path, monkeypatch, caplog):
@@ -305,7 +314,8 @@ def test_a_dry_run_tells_what_a_stage_costs_and_writes_nothing(tmp_path, monkeyp
     monkeypatch.setitem(ablations.PRESETS, "toy", TOY)
     monkeypatch.setattr(training_command, "measure", partial(dry_run.measure, seconds=0.1))
     with caplog.at_level("INFO"):
-        assert training_command.train_preset("toy", tmp_path / "new", device="cpu", stage="dit", dry_run=True) is None
+        options = TrainOptions(device="cpu", stage="dit", dry_run=True)
+        assert training_command.train_preset("toy", tmp_path / "new", options) is None
     assert "dit: parameters network" in caplog.text and "steps per second" in caplog.text
     assert not (tmp_path / "new").exists()
 

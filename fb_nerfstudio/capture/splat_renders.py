@@ -1,0 +1,137 @@
+"""What splats look like while they are trained: colours, depth and accumulation from cameras of ours, and the surfaces
+that they show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
+
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
+from fb_nerfstudio.bridge import to_nerfstudio
+
+SOLID = 0.5
+"""Accumulation from which a pixel counts as covered by splats; below, it is a hole."""
+FIRM = 0.75
+"""Accumulation from which the splats' colours are believed beside the captured pictures, and as a start of generation.
+(A room at step 500: 14 dB from 0.5 on, which generated views exceed, 19 dB from 0.75 on, 27 dB from 0.95 on.)
+"""
+TRAINED_STEPS = 100
+"""Steps after which the splats' own depth and accumulation are believed."""
+SMALL_SIDE = 64
+"""Pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures."""
+
+
+@runtime_checkable
+class TrainedSplats(Protocol):
+    """What generation needs of the model that is trained (:mod:`fb_nerfstudio.splats.splat_model`)."""
+
+    training: bool
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters are."""
+        ...
+
+    @property
+    def means(self) -> Tensor:
+        """Centres of the Gaussians [m, 3] in the world of the training."""
+        ...
+
+    @property
+    def room(self) -> int | None:
+        """Gaussians that its limit leaves room for; None without a limit."""
+        ...
+
+    def train(self, mode: bool = True) -> Any:
+        """Switch to training, or to evaluation."""
+        ...
+
+    def eval(self) -> Any:
+        """Switch to evaluation."""
+        ...
+
+    def get_outputs_for_camera(self, camera: Cameras) -> Mapping[str, Tensor]:
+        """A render's ``rgb``, ``accumulation`` and ``depth`` ([h, w, c])."""
+        ...
+
+    def add_gaussians(self, points: Tensor, colors: Tensor, optimizers: Optimizers | None) -> int:
+        """Append Gaussians between two iterations; returns how many there was room for."""
+        ...
+
+    def remove_gaussians(self, chosen: Tensor, optimizers: Optimizers | None) -> int:
+        """Take the chosen Gaussians away between two iterations; returns how many went."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """What the splats look like from some cameras, on the CPU."""
+
+    depth: Float[Tensor, "n h w"]
+    """Expected z-depth in scene units; means nothing where accumulation is low."""
+    accumulation: Float[Tensor, "n h w"]
+    """Opacity in [0, 1]."""
+    rgb: Float[Tensor, "n 3 h w"]
+    """Colours in [0, 1], over the model's background where the splats are not opaque."""
+
+    @property
+    def solid(self) -> Bool[Tensor, "n h w"]:
+        """True where splats cover the pixel at a depth that means something."""
+        return (self.accumulation >= SOLID) & torch.isfinite(self.depth) & (self.depth > 0)
+
+
+def coarse(cameras: Pinholes) -> Pinholes:
+    """The same cameras with small pictures, on the CPU."""
+    scale = min(1.0, SMALL_SIDE / max(cameras.width, cameras.height))
+    return cameras.to("cpu", torch.float32).scaled(
+        max(1, round(cameras.width * scale)), max(1, round(cameras.height * scale))
+    )
+
+
+@torch.no_grad()
+def render_geometry(splats: TrainedSplats, cameras: Pinholes) -> Rendered:
+    """Colours, depth and accumulation of the splats from each camera, in evaluation mode; the training mode is
+    restored. On the CPU.
+    """
+    was_training = splats.training
+    splats.eval()
+    try:
+        outputs = [
+            splats.get_outputs_for_camera(to_nerfstudio(cameras[index], splats.device)) for index in range(len(cameras))
+        ]
+    finally:
+        splats.train(was_training)
+    return Rendered(
+        depth=torch.stack([one["depth"][..., 0].float().cpu() for one in outputs]),
+        accumulation=torch.stack([one["accumulation"][..., 0].float().cpu() for one in outputs]),
+        rgb=torch.stack([one["rgb"].movedim(-1, 0).float().cpu() for one in outputs]),
+    )
+
+
+def surface_points(splats: TrainedSplats, cameras: Sequence[Pinholes], *, limit: int = 20000) -> Float[Tensor, "m 3"]:
+    """World points of what the splats show in the captured cameras (at most ``limit``, evenly spread over the
+    pictures).
+    """
+    groups = []
+    for camera in cameras:
+        small = coarse(camera)
+        rendered = render_geometry(splats, small)
+        groups.append(small.unproject(rendered.depth)[rendered.solid])
+    points = torch.cat(groups) if groups else torch.empty(0, 3)
+    return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
+
+
+def free_space(splats: TrainedSplats, cameras: Sequence[Pinholes]) -> FreeSpace:
+    """What rays of the captured cameras have crossed on their way to the surfaces that the splats show."""
+    small = [coarse(camera) for camera in cameras]
+    rendered = [render_geometry(splats, camera) for camera in small]
+    return FreeSpace(cameras=tuple(small), depth=tuple(torch.where(one.solid, one.depth, 0.0)[0] for one in rendered))
