@@ -320,9 +320,7 @@ def _require_free_places(command: object) -> None:
 
 
 def compile_() -> None:
-    """Compile the drawing of splats for this machine, once (needs gcc or clang): two to three times as fast as torch
-    alone, same pictures.
-    """
+    """Compile the drawing of splats for this machine's CPU, once (needs gcc or clang): twice as fast, same pictures."""
     from method_configs.commands.compilation import compile_splats
 
     compile_splats()
