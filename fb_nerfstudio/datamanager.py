@@ -47,7 +47,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell
 from fb_core.machine.precision import in_words
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager
-from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d, without_open3d
+from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d, files_read, without_open3d
 from fb_nerfstudio.capture.start_points import start_points
 from fb_nerfstudio.capture.unseen import TRAINED_STEPS, free_space, seen_by_nobody_else, surface_points
 from fb_nerfstudio.checks.exports import refuse_empty_exports
@@ -586,7 +586,8 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
         if trainer is None:
             return None
         data = self.config.data or self.config.dataparser.data
-        target = views_target(Path(trainer.base_dir) / COMPLETION_FOLDER, inputs=() if data is None else (Path(data),))
+        inputs = files_read(self.train_dataparser_outputs, data)
+        target = views_target(Path(trainer.base_dir) / COMPLETION_FOLDER, inputs=inputs)
         try:
             target.check()
         except ValueError as error:

@@ -20,14 +20,19 @@ from pathlib import Path
 import torch
 
 from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
+from fb_core.data.meshes.mesh_views import find_meshes
+from fb_core.data.training.capture_sequences import find_captures
 from fb_core.data.training.folders import TrainingData
+from fb_core.data.training.shard_stream import find_shards
 from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
+from fb_core.machine.resources import usable_device
 from fb_core.training.dry_run import Cost, measure
-from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
+from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, require_text_encoder, run_stage
 from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import Group, joined
 from fb_core.training.run.loop import EngineConfig, OnProgress
 from fb_core.training.run.progress_log import ProgressLog
+from fb_core.training.stages.perceptual import load_lpips
 from method_configs.presets import PRESETS
 
 _logger = logging.getLogger(__name__)
@@ -84,9 +89,10 @@ def train_preset(
         name: True for name, value in flags.items() if value
     }
     engine = dataclasses.replace(recipe.engine, **changes)
+    _require_data(recipe, stages, dry_run=dry_run)
     if not dry_run:
         _require_own_model_or_free(output, start_from)  # before days of training, not after them
-    with joined(_device(device)) as (group, where):
+    with joined(usable_device(device)) as (group, where):
         if dry_run:
             for name in stages:
                 _say(group, "%s", _told(name, measure(recipe, name, device=where, engine=engine, group=group)))
@@ -170,6 +176,34 @@ def _require_own_model_or_free(output: Path, start_from: Path | None) -> None:
         )
 
 
+def _require_data(recipe: Recipe, stages: tuple[str, ...], *, dry_run: bool) -> None:
+    """Raises ValueError, before the first stage, for data that were named and are not there or that the preset does not
+    learn from, and for the text model where a later stage needs it.
+    """
+    data, reads_text = recipe.data, bool(recipe.dit.text_width)
+    named = {
+        "images": (data.images, bool(recipe.single_view_share), "captioned pictures"),
+        "lpips": (data.lpips, bool(recipe.image_vae_loss.perceptual), "LPIPS"),
+        "text_encoder": (data.text_encoder, reads_text, "text"),
+    }
+    for name, (given, is_used, what) in named.items():
+        if given is not None and not is_used:
+            raise ValueError(
+                f"{name}: preset {recipe.name!r} learns nothing from {what}; leave it out, or choose another preset, "
+                f"got {given}"
+            )
+    if data.captures is not None:
+        find_captures(data.captures)
+    if data.meshes is not None:
+        find_meshes(data.meshes)
+    if data.images is not None:
+        find_shards(data.images)
+    if data.lpips is not None and "image-vae" in stages:
+        load_lpips(data.lpips)
+    if reads_text and "dit" in stages and not (dry_run and data.text_encoder is None):
+        require_text_encoder(recipe)
+
+
 def _recipe(preset: str) -> Recipe:
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
@@ -195,19 +229,6 @@ def _require_positive(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not value > 0:
             raise ValueError(f"{name}: expected a positive number, got {value}")
-
-
-def _device(name: str | None) -> torch.device:
-    """The device asked for, checked before any work; by default the first GPU, or the CPU where there is none."""
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {name!r}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {name!r} was asked for, but torch finds no GPU on this machine; use cpu")
-    return device
 
 
 def _say(group: Group, message: str, *values: object) -> None:
