@@ -18,7 +18,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.files.limits import require_decodable
+from fb_core.files.limits import require_decodable, require_text_name
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 LEAST_ALPHA = 1e-6
@@ -73,6 +73,7 @@ def opened(path: Path):
     """
     import OpenImageIO as oiio
 
+    require_text_name(path)
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), settings)

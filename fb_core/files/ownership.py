@@ -15,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fb_core.files.limits import require_text_name
+
 MARK_NAME = ".fillerbuster.json"
 _MADE_BY, _FORMAT = "fillerbuster", 1
 _LOOKED_AT_BYTES = 8192  # of a file's beginning, and of its end
@@ -51,6 +53,7 @@ class Target:
         folder = real_place(
             self.folder
         )  # what is written: "missing/.." leads somewhere though the system does not find it yet
+        require_text_name(folder)
         if folder.is_symlink():
             raise ValueError(f"{folder} is a link, which is neither followed nor replaced; choose another folder")
         if not folder.exists():

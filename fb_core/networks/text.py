@@ -22,13 +22,12 @@ class TextEncoder:
         self.model = model
 
     @staticmethod
-    def from_folder(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> "TextEncoder":
-        """Read tokenizer and text model from a local clone of `openai/clip-vit-large-patch14`; nothing is downloaded.
-
-        Raises ValueError if the package transformers, the folder or its contents are absent.
+    def require(folder: str | os.PathLike[str]) -> None:
+        """Raises ValueError if the package transformers or the folder is absent; nothing is read, so that it takes no
+        time.
         """
         try:
-            from transformers import CLIPTextModel, CLIPTokenizer  # pyright: ignore[reportMissingImports]
+            import transformers  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ValueError(
                 "text: prompts need the package transformers, which `pip install 'fillerbuster[text]'` installs."
@@ -38,6 +37,16 @@ class TextEncoder:
                 "text: expected a folder with the CLIP text model (a clone of openai/clip-vit-large-patch14), got "
                 f"{folder}."
             )
+
+    @staticmethod
+    def from_folder(folder: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> "TextEncoder":
+        """Read tokenizer and text model from a local clone of `openai/clip-vit-large-patch14`; nothing is downloaded.
+
+        Raises ValueError if the package transformers, the folder or its contents are absent.
+        """
+        TextEncoder.require(folder)
+        from transformers import CLIPTextModel, CLIPTokenizer  # pyright: ignore[reportMissingImports]
+
         try:
             tokenizer = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
             model = CLIPTextModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)

@@ -190,13 +190,22 @@ def _encode_text(recipe: Recipe, device: torch.device | str, *, stands_in: bool)
     return _text_encoder(recipe, device).encode
 
 
-def _text_encoder(recipe: Recipe, device: torch.device | str) -> TextEncoder:
+def require_text_encoder(recipe: Recipe) -> None:
+    """Raises ValueError where a preset that reads text was given no folder for it, or one that is none; weights are not
+    read.
+    """
     if recipe.data.text_encoder is None:
         raise ValueError(
             f"preset {recipe.name!r} reads text: give a folder with the CLIP text model (a clone of "
             "openai/clip-vit-large-patch14), "
             "or choose a preset without text"
         )
+    TextEncoder.require(recipe.data.text_encoder)
+
+
+def _text_encoder(recipe: Recipe, device: torch.device | str) -> TextEncoder:
+    require_text_encoder(recipe)
+    assert recipe.data.text_encoder is not None
     return TextEncoder.from_folder(recipe.data.text_encoder, device=device)
 
 

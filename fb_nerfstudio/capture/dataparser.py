@@ -285,6 +285,17 @@ def without_open3d(config: DataParserConfig) -> DataParserConfig:
     return config
 
 
+def files_read(outputs: DataparserOutputs, data: Path | None) -> tuple[Path, ...]:
+    """What a run reads of its capture: the file that describes it, and one picture or mask of every folder of them.
+
+    Not the capture's folder as such: nerfstudio names runs after it, so that ``--data outputs/room --output-dir
+    outputs`` has its runs in ``outputs/room``.
+    """
+    pictures = [Path(path).resolve() for path in (*outputs.image_filenames, *(outputs.mask_filenames or ()))]
+    described = () if data is None else (data if data.is_file() else data / "transforms.json",)
+    return (*described, *{path.parent: path for path in pictures}.values())
+
+
 def smaller_copy(path: Path, capture: Capture, prefix: str, factor: int) -> Path:
     """Where the copy of a picture, mask or depth lies that is smaller by a factor: in images_4 and the like, with or
     without the folders below images in which a rig's pictures lie.

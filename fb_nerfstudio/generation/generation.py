@@ -17,6 +17,7 @@ from fb_core.completion.rounds import Inpainter
 from fb_core.files.whole import remove_folder, whole_file
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager
+from fb_nerfstudio.capture.dataparser import files_read
 from fb_nerfstudio.capture.splat_renders import TrainedSplats
 from fb_nerfstudio.generation.fitting_in import fitted_in
 from fb_nerfstudio.generation.next_round import report_of
@@ -99,7 +100,7 @@ class Generation:
         config = self.captured.config
         data = config.data or config.dataparser.data
         folder = Path(self.trainer.base_dir) / COMPLETION_FOLDER
-        target = views_target(folder, inputs=() if data is None else (Path(data),))
+        target = views_target(folder, inputs=files_read(self.captured.train_dataparser_outputs, data))
         try:
             target.check()
         except ValueError as error:

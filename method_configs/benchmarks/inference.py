@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.resources import usable_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     from fb_core.evaluation.results import Report
@@ -60,7 +61,7 @@ class Inference(TableFiles):
             raise ValueError(
                 f"inference: expected sizes that are multiples of 16 pixels, got {' '.join(map(str, self.sizes))}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
         reckoned = model.device.type == "cpu" if self.reckoned is None else self.reckoned
         cells = [(size, views) for size in self.sizes for views in self.views]
         report = Report(seed=self.seed)

@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 import tyro
 
 from fb_core.files.faults import sentence_of
+from fb_core.files.limits import MOST_SEED, require_between
 from fb_core.files.ownership import require_own_or_new
 from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, stop_on_signals
 from method_configs.benchmarks.builds import Builds
@@ -286,7 +287,7 @@ def bench(
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
-    _require_free_places(benchmark)
+    _require_usable(benchmark)
     benchmark.run()
 
 
@@ -307,16 +308,19 @@ def evaluate(
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""
-    _require_free_places(evaluation)
+    _require_usable(evaluation)
     evaluation.run()
 
 
-def _require_free_places(command: object) -> None:
-    """Raises ValueError, before hours of measuring, where a result would take the place of a file that is none."""
+def _require_usable(command: object) -> None:
+    """Raises ValueError, before hours of measuring, where a result would take the place of a file that is none, and for
+    a seed that nothing can be drawn with.
+    """
     for name in ("json", "csv", "markdown", "figure", "sheet"):
         path = getattr(command, name, None)
         if isinstance(path, Path):
             require_own_or_new(path)
+    require_between("seed", getattr(command, "seed", 0), 0, MOST_SEED)
 
 
 def compile_() -> None:

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from fb_core.files.limits import MOST_SEED, MOST_TRAINING_STEPS, require_between
 from fb_core.files.ownership import MARK_NAME, Target, mark_text
 from fb_core.files.whole import remove_folder, swept, whole_file
 from fb_core.machine.resources import usable_cores
@@ -48,6 +49,8 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
 
     if iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {iterations}")
+    require_between("seed", seed, 0, MOST_SEED)
+    require_between("iterations", iterations, 1, MOST_TRAINING_STEPS)
     read_config(model or BUNDLED_MODEL)  # a missing model is told before anything is made
     output = output.absolute()
     _clear(output, inputs=() if model is None else (model,))

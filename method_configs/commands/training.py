@@ -21,12 +21,17 @@ from pathlib import Path
 import torch
 
 from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
+from fb_core.data.meshes.mesh_views import find_meshes
+from fb_core.data.training.capture_sequences import find_captures
+from fb_core.data.training.shard_stream import find_shards
+from fb_core.machine.resources import usable_device
 from fb_core.training.dry_run import Cost, measure
-from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
+from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, require_text_encoder, run_stage
 from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import Group, joined
 from fb_core.training.run.loop import EngineConfig, OnProgress
 from fb_core.training.run.progress_log import ProgressLog
+from fb_core.training.stages.perceptual import load_lpips
 from method_configs.commands.train_options import TrainOptions
 from method_configs.presets import PRESETS
 
@@ -72,9 +77,11 @@ def train_preset(preset: str, output: Path, options: TrainOptions = TrainOptions
     options.require_sensible()
     recipe = dataclasses.replace(_recipe(preset), data=options.data, start_from=options.start_from)
     engine = dataclasses.replace(recipe.engine, **options.engine_changes)
+    stages = STAGES if options.stage == "all" else (options.stage,)
+    _require_data(recipe, stages, dry_run=options.dry_run)
     if not options.dry_run:
         _require_own_model_or_free(output, options.start_from)  # before days of training, not after them
-    with joined(_device(options.device)) as (group, where):
+    with joined(usable_device(options.device)) as (group, where):
         training = _Training(recipe=recipe, output=output, options=options, engine=engine, device=where, group=group)
         if options.dry_run:
             for name in training.stages:
@@ -153,6 +160,34 @@ def _require_own_model_or_free(output: Path, start_from: Path | None) -> None:
         )
 
 
+def _require_data(recipe: Recipe, stages: tuple[str, ...], *, dry_run: bool) -> None:
+    """Raises ValueError, before the first stage, for data that were named and are not there or that the preset does not
+    learn from, and for the text model where a later stage needs it.
+    """
+    data, reads_text = recipe.data, bool(recipe.dit.text_width)
+    named = {
+        "images": (data.images, bool(recipe.single_view_share), "captioned pictures"),
+        "lpips": (data.lpips, bool(recipe.image_vae_loss.perceptual), "LPIPS"),
+        "text_encoder": (data.text_encoder, reads_text, "text"),
+    }
+    for name, (given, is_used, what) in named.items():
+        if given is not None and not is_used:
+            raise ValueError(
+                f"{name}: preset {recipe.name!r} learns nothing from {what}; leave it out, or choose another preset, "
+                f"got {given}"
+            )
+    if data.captures is not None:
+        find_captures(data.captures)
+    if data.meshes is not None:
+        find_meshes(data.meshes)
+    if data.images is not None:
+        find_shards(data.images)
+    if data.lpips is not None and "image-vae" in stages:
+        load_lpips(data.lpips)
+    if reads_text and "dit" in stages and not (dry_run and data.text_encoder is None):
+        require_text_encoder(recipe)
+
+
 def _recipe(preset: str) -> Recipe:
     if preset not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
@@ -172,19 +207,6 @@ def _steps_done(folder: Path) -> int:
         folder.name == "dit" or (folder / "spread.json").exists()
     )  # killed while measuring its latents
     return read_state(path, mapped=True)["step"] if complete else 0
-
-
-def _device(name: str | None) -> torch.device:
-    """The device asked for, checked before any work; by default the first GPU, or the CPU where there is none."""
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {name!r}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {name!r} was asked for, but torch finds no GPU on this machine; use cpu")
-    return device
 
 
 def _cost_in_words(stage: str, cost: Cost) -> str:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.resources import usable_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     from fb_core.evaluation.capture_questions import CaptureViews
@@ -55,7 +56,7 @@ class Conditioning(TableFiles):
                 f"got known {' '.join(map(str, self.known)) or 'none'}, hidden {self.hidden}, sequences "
                 f"{self.sequences}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
         sampling = model.recommended_sampling
         sampling = sampling if self.steps is None else dataclasses.replace(sampling, steps=self.steps)
         sequences = self._sequences(self.size or model.size)

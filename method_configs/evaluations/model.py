@@ -9,7 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.resources import usable_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     from fb_core.evaluation.ablations import Asked
@@ -79,7 +80,7 @@ class ModelOnCaptures(TableFiles):
             )
         distance, models = _distance(self.lpips), {}
         for folder in self.models or (None,):
-            model = Fillerbuster.from_pretrained(folder, device=chosen_device(self.device))
+            model = Fillerbuster.from_pretrained(folder, device=usable_device(self.device))
             models["bundled" if folder is None else folder.name] = model
         if len(models) < len(self.models):
             raise ValueError(

@@ -10,7 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.resources import usable_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     import torch
@@ -63,7 +64,7 @@ class Trust(TableFiles):
                 "trust: expected at least 4 known views, fewer than views, and at least one room and sample, "
                 f"got known {self.known}, views {self.views}, rooms {self.rooms}, samples {self.samples}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
         found = [self._room(model, number) for number in track(range(self.rooms), description="rooms", transient=True)]
         rows = []
         for part in PARTS:

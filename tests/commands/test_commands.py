@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -171,14 +172,44 @@ def test_train_stops_when_the_time_is_up_and_begins_no_further_stage(toy_preset,
     ("arguments", "sentence"),
     [
         (("nothing",), "preset: expected one of"),
-        (("toy", "--stage", "dit"), "train that stage first"),
         (("toy", "--steps", 0), "steps: expected a positive number, got 0"),
         (("toy", "--minutes", -1), "minutes: expected a positive number, got -1.0"),
         (("toy", "--device", "toaster"), "device: expected cpu, cuda or cuda:N, got 'toaster'"),
+        (("toy", "--device", "meta"), "device: expected one that this machine has, such as cpu, got 'meta'"),
+        (("toy", "--images", "missing"), "images: preset 'toy' learns nothing from captioned pictures"),
+        (("toy", "--lpips", "missing"), "lpips: preset 'toy' learns nothing from LPIPS"),
+        (("toy", "--text-encoder", "missing"), "text_encoder: preset 'toy' learns nothing from text"),
+        (("paper",), "preset 'paper' reads text: give a folder with the CLIP text model"),
+        (("paper", "--text-encoder", "missing"), "text: "),
+        (("paper", "--text-encoder", ".", "--lpips", "missing"), "lpips: expected torchvision's weights"),
+        (("paper", "--text-encoder", ".", "--images", "missing"), "images: expected WebDataset shards"),
+        (("toy", "--captures", "missing"), "captures: expected folders with a transforms.json"),
+        (("toy", "--meshes", "missing"), "meshes: expected files of"),
     ],
 )
-def test_train_refuses_nonsense(toy_preset, tmp_path, capsys, arguments, sentence):
-    assert sentence in refusal(capsys, "train", *arguments, "--output", tmp_path)
+def test_train_refuses_nonsense_before_it_works(toy_preset, tmp_path, capsys, monkeypatch, arguments, sentence):
+    """Also what a later stage alone would have stumbled on, after days of the first."""
+    from method_configs.commands import training
+
+    monkeypatch.setattr(training, "run_stage", lambda *_, **__: pytest.fail("a stage was begun"))
+    assert sentence in refusal(capsys, "train", *arguments, "--output", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_train_refuses_a_stage_whose_earlier_ones_are_missing(toy_preset, tmp_path, capsys):
+    assert "train that stage first" in refusal(capsys, "train", "toy", "--stage", "dit", "--output", tmp_path)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**70])
+@pytest.mark.parametrize(
+    "command",
+    [("rooms", "--output", "new"), ("complete", ".", "--output", "new"), ("demo", "--output", "new"),
+     ("eval", "rooms"), ("bench", "networks"), ("bench", "inference")],
+)  # fmt: skip
+def test_a_seed_that_nothing_can_be_drawn_with_is_told_at_once(tmp_path, capsys, monkeypatch, command, seed):
+    monkeypatch.chdir(tmp_path)
+    assert re.search("seed.* at least 0|seed: expected 0 to 4.29", refusal(capsys, *command, "--seed", seed))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_train_refuses_a_gpu_that_is_not_there(toy_preset, tmp_path, capsys, monkeypatch):

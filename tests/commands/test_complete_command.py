@@ -361,6 +361,28 @@ def test_wishes_that_cannot_be_met_are_refused(tmp_path: Path, model: Path, caps
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("frames", [("--frames", "model"), ("--frames", "scene"), ("--poses-only",)])
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--device", "toaster"), "device: expected cpu, cuda or cuda:N, got 'toaster'"),
+        (("--device", "meta"), "device: expected one that this machine has, such as cpu, got 'meta'"),
+        (("--path", "loop"), "--path: expected ellipse, orbit, spiral"),
+        (("--path", "missing.json"), "camera path missing.json: no such file"),
+        (("--known-poses", "missing"), "missing: no such folder"),
+        (("--model", "missing"), "there is no folder missing"),
+        (("--prompt", "a sofa"), "--prompt: this model reads no text"),
+    ],
+)
+def test_what_cannot_be_used_is_told_before_photos_are_read(
+    tmp_path: Path, model: Path, capsys, monkeypatch, frames, options, sentence
+):
+    """On fifty photos a device was told after minutes only, when all cameras had been found."""
+    monkeypatch.setattr(complete_command, "read_photos", lambda _: pytest.fail("photos were read"))
+    assert sentence in refusal(capsys, tmp_path, tmp_path / "out", model, *frames, *options)
+    assert not (tmp_path / "out").exists()
+
+
 def test_only_ones_own_output_is_replaced_and_only_when_asked(tmp_path: Path, model: Path, capsys):
     source = posed(tmp_path / "capture", cameras_on_an_arc(3, width=20, height=20))
     _folder(tmp_path / "out")  # an empty folder may be there

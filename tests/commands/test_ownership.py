@@ -7,6 +7,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers.folders.owned import files, marked, refusal
@@ -16,6 +17,7 @@ from helpers.tiny_models import save_tiny_model
 from fb_core import checkpoint
 from fb_core.checkpoint import model_hash
 from fb_core.completion.results.completed_views import views_target
+from fb_core.data.capture.captures import read_capture
 from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of
 from fb_core.files.whole import whole_folder
 from fb_nerfstudio.datamanager import FillerbusterDataManager
@@ -275,11 +277,47 @@ def test_a_training_replaces_its_own_views_alone(tmp_path: Path, tiny_capture: P
     class Manager:
         generated_views = generated_views()
         config = type("Config", (), {"data": tiny_capture, "dataparser": None})
+        train_dataparser_outputs = _pictures_of(tiny_capture)
 
     for views in (generated_views(), None):
         Manager.generated_views = views
         assert FillerbusterDataManager._save_bank(Manager(), Trainer()) is None  # type: ignore[arg-type]
     assert files(tmp_path) == before and "the generated views are in the checkpoint alone" in caplog.text
+
+
+def _pictures_of(capture: Path) -> SimpleNamespace:
+    """What nerfstudio knows of a capture's files."""
+    return SimpleNamespace(image_filenames=[frame.image_path for frame in read_capture(capture).frames],
+                           mask_filenames=None)  # fmt: skip
+
+
+def test_a_run_within_its_capture_keeps_all_of_its_rounds(tmp_path: Path, tiny_capture: Path, caplog):
+    """nerfstudio names runs after the capture, so the quickstart's first command puts the run into outputs/room, which
+    it reads; from the second round on generated views, also those asked for in the viewer, were in no folder.
+    """
+    room = shutil.copytree(tiny_capture, tmp_path / "outputs" / "room")
+    run = room / "fillerbuster" / "first"
+
+    class Trainer:
+        base_dir = run
+
+    class Manager:
+        generated_views = generated_views()[[0]]
+        config = type("Config", (), {"data": room, "dataparser": None})
+        train_dataparser_outputs = _pictures_of(room)
+        _trust, _rounds = None, SimpleNamespace(record=[])
+
+    captured = files(room)
+    for views in (generated_views()[[0]], generated_views()):
+        Manager.generated_views = views
+        assert FillerbusterDataManager._save_bank(Manager(), Trainer()) == run / "completion"  # type: ignore[arg-type]
+        assert len(list((run / "completion" / "images").iterdir())) == len(views)
+    assert files(room).items() >= captured.items() and not caplog.records
+    Manager.config.data = run / "completion"  # what it reads it does not replace, whatever the mark says
+    Manager.train_dataparser_outputs = _pictures_of(run / "completion")
+    before = files(room)
+    assert FillerbusterDataManager._save_bank(Manager(), Trainer()) is None  # type: ignore[arg-type]
+    assert files(room) == before and "holds the input" in caplog.text
 
 
 def test_saving_a_model_survives_that_its_second_rename_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

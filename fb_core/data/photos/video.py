@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.data.photos.film_colours import to_rgb
-from fb_core.files.limits import MOST_FILM_PIXELS, require_decodable
+from fb_core.files.limits import MOST_FILM_PIXELS, require_decodable, require_text_name
 
 FILM_SUFFIXES = (
     ".mp4",
@@ -321,6 +321,7 @@ def _opened(path: Path) -> Any:
     import av
     from av.error import FFmpegError
 
+    require_text_name(path)
     try:
         container = av.open(str(path))
     except PermissionError:

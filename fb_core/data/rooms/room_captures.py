@@ -24,6 +24,7 @@ from fb_core.data.capture.point_cloud import Points
 from fb_core.data.rooms.ray_caster import RoomImages, cast, render
 from fb_core.data.rooms.room import FAMILIES, Room, make_room
 from fb_core.data.rooms.room_cameras import CAMERA_CLEARANCE_METRES, cameras_by_angles, free_positions
+from fb_core.files.limits import MOST_SEED, require_between
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
@@ -76,6 +77,7 @@ def casual_capture(
     for name, value, least in (("seed", seed, 0), ("views", views, 2), ("size", size, 16), ("held_out", held_out, 2)):
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}")
+    require_between("seed", seed, 0, MOST_SEED)
     pixels = (views + held_out) * size * size  # all views are drawn at once, four rays a pixel
     if pixels > _MOST_PIXELS:
         raise ValueError(

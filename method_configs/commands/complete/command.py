@@ -17,6 +17,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from fb_core import checkpoint
 from fb_core.completion.duration import in_words
 from fb_core.completion.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
 from fb_core.data.capture.camera_path import read_camera_path
@@ -32,8 +33,8 @@ from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.camera_paths import PATHS, path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
-from fb_core.inpainter import Fillerbuster
-from fb_core.machine.resources import peak_memory_bytes
+from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster
+from fb_core.machine.resources import peak_memory_bytes, usable_device
 from method_configs.commands.complete.forecast import forecast
 from method_configs.commands.complete.options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
@@ -67,12 +68,13 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     source, output = source.absolute(), output.absolute()
     target = _target(source, output, options, overwrite)
     target.check()
+    scene = options.frames == "scene" and not options.poses_only
+    _require_usable(options, scene=scene)
     clock = _Clock()
     with clock.stage("reading"):
         job = _read(source, options)
     target = _with_pictures(target, job.photos)
     target.check()
-    scene = options.frames == "scene" and not options.poses_only
     with clock.stage("loading the model"):
         from_model = not options.poses_only and not scene
         model = _load_model(options, needed=from_model or (options.cameras != "features" and not job.all_known))
@@ -103,18 +105,31 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     return report
 
 
+def _require_usable(options: CompleteOptions, *, scene: bool) -> None:
+    """Raises ValueError in one sentence, before photos are read and cameras looked for, which takes minutes: for a
+    device, a path, known cameras, a model or a prompt that cannot be used. Weights are mapped, not read.
+    """
+    usable_device(options.device)
+    _path_of_file(options, _CHECKED_SIDE)
+    if options.known_poses is not None:
+        read_capture(options.known_poses)
+    if options.cameras != "features" or not (scene or options.poses_only):
+        reads_text = bool(checkpoint.load(options.model or BUNDLED_MODEL).config.transformer.text_width)
+        _require_readable(options, reads_text=reads_text)
+    if scene:
+        from fb_core.completion.options import CompletionConfig  # nerfstudio takes a while
+        from fb_nerfstudio.refusal import refuse_bad_model
+
+        given = {"model": options.model, "prompt": options.prompt or "", "text_encoder": options.text_encoder}
+        refuse_bad_model(CompletionConfig(enabled=options.generate, **given))
+
+
 def _work_of_scene(
     job: Job, options: CompleteOptions, output: Path, model: Fillerbuster | None
 ) -> AbstractContextManager[Path]:
-    """Where the work is kept. Raises ValueError in one sentence for a model, a prompt or a path that cannot be used."""
-    from fb_core.completion.options import CompletionConfig  # nerfstudio takes a while
-    from fb_nerfstudio.refusal import refuse_bad_model
+    """Where the work is kept."""
     from method_configs.commands.complete.scene_work import question_of, work_beside
 
-    given = {"model": options.model, "prompt": options.prompt or "", "text_encoder": options.text_encoder}
-    refuse_bad_model(CompletionConfig(enabled=options.generate, **given))
-    if options.path not in PATHS:
-        _path_of_file(options, _CHECKED_SIDE)  # says what is wrong with it
     return work_beside(output, question_of(job.photos, options, None if model is None else model.model_hash))
 
 
@@ -233,11 +248,15 @@ def _same_file(one: Path, other: Path) -> bool:
 def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | None:
     if not needed:
         return None
-    device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    device = usable_device(options.device)
     model = Fillerbuster.from_pretrained(options.model, device=device, text_encoder=options.text_encoder)
-    if options.prompt and not model.reads_text:
-        raise ValueError(f"--prompt: this model reads no text; leave the prompt out, got {options.prompt!r}")
+    _require_readable(options, reads_text=model.reads_text)
     return model
+
+
+def _require_readable(options: CompleteOptions, *, reads_text: bool) -> None:
+    if options.prompt and not reads_text:
+        raise ValueError(f"--prompt: this model reads no text; leave the prompt out, got {options.prompt!r}")
 
 
 # ---- work ------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 from fb_core.completion.fly_through import Passes, plan_passes, room_beside
-from fb_core.files.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_STEPS, MOST_VIEWS, require_between
+from fb_core.files.limits import (
+    MOST_SAMPLING_STEPS,
+    MOST_SEED,
+    MOST_SIDE,
+    MOST_TRAINING_STEPS,
+    MOST_VIEWS,
+    require_between,
+)
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.machine.precision import Precision
 from fb_core.registration.by_raymaps import ROUNDS
@@ -89,6 +96,7 @@ class CompleteOptions:
             if value is not None and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
             require_between(name, value or least, least, most)
+        require_between("seed", self.seed, 0, MOST_SEED)
         if not 0 < self.minutes <= _MOST_MINUTES:
             raise ValueError(f"minutes: expected above 0 and at most {_MOST_MINUTES}, got {self.minutes:g}")
         if not 0 < self.fps <= 240:

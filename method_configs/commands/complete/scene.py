@@ -37,6 +37,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.similarity import Similarity
 from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
+from fb_core.machine.resources import usable_device
 from fb_core.memory.budget import GIB
 from fb_nerfstudio.splats.backend import BLUR
 from fb_nerfstudio.splats.scene_film import FilmFrame, film_frame, seen_by_photos
@@ -82,7 +83,7 @@ class SceneJob:
             cameras=[found.camera(index).to(torch.float64) for index in found.trusted],
             points_path=points_path,
             options=options,
-            device=options.device or ("cuda" if torch.cuda.is_available() else "cpu"),
+            device=str(usable_device(options.device)),
             work=work,
         )
 

@@ -32,6 +32,15 @@ def way(request, monkeypatch: pytest.MonkeyPatch) -> str:
     return request.param
 
 
+def test_a_folder_whose_name_is_no_text_is_refused_before_work(tmp_path: Path):
+    """Libraries for pictures take no such names; a room ended in a TypeError after all its pictures were drawn."""
+    target = Target(folder=tmp_path / os.fsdecode(b"caf\xe9"), kind="room")
+    with pytest.raises(ValueError, match=r"caf\\udce9: expected a name in UTF-8, got other bytes; rename it"):
+        with whole_folder(target):
+            pytest.fail("work was begun")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_this_system_exchanges_folders_in_one_step(tmp_path: Path):
     if sys.platform != "linux":
         pytest.skip("renameat2 is Linux's")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import logging
 import math
+import os
 import shutil
 from pathlib import Path
 
@@ -427,6 +428,21 @@ def test_a_text_file_named_jpg_and_a_truncated_photo_are_left_out_and_named(
     with caplog.at_level(logging.WARNING):
         assert [photo.name for photo in read_photos(tmp_path)] == ["a", "b"]
     assert len(caplog.records) == 2 and "notes.jpg" in caplog.text and "c.png" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", [b".png", b".mp4"])
+def test_names_that_are_no_text(tmp_path: Path, caplog: pytest.LogCaptureFixture, suffix: bytes) -> None:
+    """Names in Latin-1 out of an old archive: the decoders take UTF-8 alone, and one ended the reading of all photos
+    in a TypeError.
+    """
+    for index in range(3):
+        save(tmp_path / f"{index}.png", scene(index))
+    odd = (tmp_path / "2.png").rename(tmp_path / os.fsdecode(b"caf\xe9" + suffix))
+    if suffix == b".mp4":
+        assert "expected a name in UTF-8" in refused(odd)
+    else:
+        assert [photo.name for photo in read_photos(tmp_path)] == ["0", "1"]
+        assert len(caplog.records) == 1 and r"caf\udce9.png: expected a name in UTF-8" in caplog.text
 
 
 def test_photos_and_folders_that_may_not_be_read(
