@@ -94,8 +94,6 @@ class LensTrial:
     """Twice the logarithm of how much likelier its places are with it."""
     focal: float
     """The likeliest focal length of its own, pixels."""
-    deviation: float
-    """Relative deviation of that."""
     likelier: bool
     """Whether that explains more than chance would if places erred independently, however little it may be."""
 
@@ -160,31 +158,30 @@ def lens_trial(sight: Sight, believed: Placed, focal: Sequence[float], own: int)
         lens=lens if clear else None,
         evidence=evidence,
         focal=free.placed.focal,
-        deviation=sigma * free.focal_deviation,
         likelier=(shared[own].cost - free.cost) / (sigma / PESSIMISM) ** 2 > one_more,
     )
 
 
-def lens_doubt(trial: LensTrial, focal: float, *, shared: bool) -> str:
-    """What speaks against a photo's lens with such a focal length (pixels), which photos are only believed to have
-    `shared`; empty if nothing does.
-    """
+def lens_doubt(trial: LensTrial, focal: float) -> str:
+    """What speaks against a photo's lens with such a focal length (pixels); empty if nothing does."""
     if trial.likelier and abs(math.log(trial.focal / focal)) > ONE_LENS:
         return f"its features ask for {trial.focal / focal:.2f} times the focal length, which the others do not confirm"
-    if shared and trial.deviation > FOCAL_GUESSED / 2:
-        return (
-            "nothing says whether it was zoomed: its features tell its focal length within "
-            f"{min(trial.deviation, 9.99):.0%} only, and no tag does"
-        )
     return ""
+
+
+def shared_doubt(deviation: float) -> str:
+    """What speaks against a photo of which nothing but its size says that it shares its lens, given how well it would
+    tell a focal length of its own (relative deviation); empty if nothing does.
+    """
+    if deviation <= FOCAL_GUESSED / 2:
+        return ""
+    return "nothing says whether it was zoomed: its features tell hardly anything of its focal length, and no tag does"
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Fit:
     placed: Placed
     cost: float
-    focal_deviation: float
-    """Relative, of a free focal length, for misses that deviate by one."""
 
 
 def _cost(fit: _Fit) -> float:
@@ -214,8 +211,7 @@ def _placed(sight: Sight, start: Placed, *, free: bool) -> _Fit:
         placed, misses, changes, squares, cost = trial, misses_there, changes_there, squares_there, there
         if gain < _CONVERGED:
             break
-    deviation = math.sqrt(max(float(np.linalg.pinv(hessian)[-1, -1]), 0.0)) if free else math.nan
-    return _Fit(placed=placed, cost=cost, focal_deviation=deviation)
+    return _Fit(placed=placed, cost=cost)
 
 
 def _zoomed(sight: Sight, placed: Placed, factor: float) -> Placed:

@@ -18,7 +18,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of
 from fb_core.geometry.features.lenses import LensGuess
-from fb_core.geometry.features.own_lens import LensTrial, Placed, lens_doubt, lens_trial, sight_of
+from fb_core.geometry.features.own_lens import LensTrial, Placed, lens_doubt, lens_trial, shared_doubt, sight_of
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_of
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
 from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses, outlying, sigma_of
@@ -238,11 +238,21 @@ class Reconstruction:
         trial = lens_trial(sight, believed, focal, int(np.searchsorted(choices, own)))
         return trial if trial.lens is None else dataclasses.replace(trial, lens=int(choices[trial.lens]))
 
-    def _lens_doubt(self, index: int, trial: LensTrial | None) -> str:
-        own = self.lenses.lens[index]
-        guessed = not self.lenses.believed[own] and not self.photos[index].same_lens
-        shared = guessed and int((self.lenses.lens == own).sum()) > 1
-        return "" if trial is None else lens_doubt(trial, float(self.lenses.focal[own]), shared=shared)
+    def _lens_doubts(self, trials: dict[int, LensTrial]) -> list[str]:
+        """What speaks against the lens of each photo; empty where nothing does."""
+        own = self.lenses.lens
+        focal = self.lenses.focal[own].tolist()
+        doubts = [
+            lens_doubt(trials[index], focal[index]) if index in trials else "" for index in range(len(self.photos))
+        ]
+        alone = self._copied(self.lenses.one_each())
+        bundle, cameras, lenses, _ = alone._bundle(np.flatnonzero(alone.used))
+        found = deviations_of(bundle, alone.lenses.known(lenses))
+        guessed = ~self.lenses.believed & ~self.lenses.fixed & (np.bincount(own) > 1)
+        for camera, index in enumerate(cameras.tolist()):
+            if guessed[own[index]] and not self.photos[index].same_lens:
+                doubts[index] = doubts[index] or shared_doubt(float(found.focal[found.lens[camera]]))
+        return doubts
 
     @property
     def bad_tags(self) -> Bool[np.ndarray, " l"]:
@@ -269,6 +279,7 @@ class Reconstruction:
         misses, counts = bundle.misses(), np.bincount(self.owner[used], minlength=len(self.photos)).tolist()
         relative = np.linalg.norm(misses, axis=1) / bundle.tolerance
         found, sigma = deviations_of(bundle, self.lenses.known(lenses)), sigma_of(relative)
+        lens_doubts = self._lens_doubts(trials)
         agreeing = agreeing_shares(self.pair_misses(matches), len(self.photos))
         shown = np.bincount(self.owner[np.isfinite(self.points[self.track, 0])], minlength=len(self.photos))
         refused = ~self.registered & (shown >= _TRUSTED_POINTS)
@@ -288,7 +299,7 @@ class Reconstruction:
             elif refused.any() and self.registered.sum() == 2:
                 reason = _TWO_OF_THREE
             else:
-                reason = outlying(relative[mine], sigma) or self._lens_doubt(index, trials.get(index))
+                reason = outlying(relative[mine], sigma) or lens_doubts[index]
             reasons.append(reason or doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
         return FeatureCameras(
             cameras=cameras,
