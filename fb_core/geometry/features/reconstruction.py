@@ -288,7 +288,8 @@ class Reconstruction:
             if not self.registered[index] or counts[index] < _FEWEST_POINTS:
                 cameras.append(None)
                 residuals.append(float("nan"))
-                reasons.append(_NO_PLACE if refused[index] else _few(counts[index], _FEWEST_POINTS, "a camera needs"))
+                shared = max(counts[index], int(shown[index]))
+                reasons.append(_NO_PLACE if refused[index] else _few(shared, _FEWEST_POINTS, "a camera needs"))
                 continue
             mine = self.owner[used] == index
             focal = self.lenses.focal[self.lenses.lens[index]]
