@@ -76,7 +76,7 @@ def _with_fitting_lenses(
         best = fitted if anew is None or _gain(fitted, anew, matches) < 0 else anew
     for within in SAME_LENS:
         lenses = best.lenses.merged(within)
-        if 1 < len(lenses.focal) < len(best.lenses.focal):  # with one, everything began
+        if len(lenses.focal) < len(best.lenses.focal):  # one lens, too: everything began with that, but less well
             merged = best.with_lenses(lenses)
             if _gain(best, merged, matches) > -_SAME_GAIN:
                 return merged

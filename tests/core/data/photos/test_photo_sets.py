@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
 from conftest import shared_path
-from helpers.textured_box import cameras_on_an_arc, render
+from helpers.textured_box import UP, cameras_on_an_arc, render
 
 from fb_core.data.photos.collection import read_photos
 from fb_core.evaluation.metrics.pose_metrics import pose_errors
@@ -90,6 +91,22 @@ def test_one_digitally_zoomed_photo_of_a_box():
     assert sum(found.trusted) >= 7 and all(found.trusted[number] for number in (0, 1, 2, 4, 5, 6, 7))
     assert result["rotation_degrees"] < 0.1 and result["center"] < 0.01 and result["focal_percent"] < 1
     assert any("2 focal lengths" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_an_orbit_with_little_overlap_keeps_its_one_lens():
+    """One focal length for all, badly begun, explained less than one each, of which two groups were left."""
+    angles = torch.arange(12) * math.radians(30.0)
+    centers = torch.stack([1.5 * angles.cos(), 1.5 * angles.sin(), 0.15 * (3 * angles).sin()], dim=1)
+    inwards = torch.stack([angles.cos(), angles.sin(), 0.2 * (2 * angles).cos()], dim=1)
+    truth = Pinholes.looking_at(centers, centers - 3 * inwards, up=UP, fov_degrees=60.0, width=480, height=360)
+    found = chain(
+        [thinned(features_of(picture, focal=None, lens="one"), number) for number, picture in enumerate(render(truth))]
+    )
+    ok = [camera if trusted else None for camera, trusted in zip(found.cameras, found.trusted, strict=True)]
+    placed = [(camera, number) for number, camera in enumerate(ok) if camera is not None]
+    result = pose_errors([camera for camera, _ in placed], [truth[number].to(torch.float64) for _, number in placed])
+    assert placed and result["rotation_degrees"] < 0.2 and result["focal_percent"] < 2, found.notes
 
 
 def thinned(photo: PhotoFeatures, seed: int, *, most: int = 700) -> PhotoFeatures:
