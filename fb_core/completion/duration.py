@@ -4,6 +4,7 @@ reaches in one.
 
 from __future__ import annotations
 
+import os
 import time
 from functools import lru_cache
 
@@ -11,6 +12,7 @@ import torch
 
 from fb_core.checkpoint import ModelConfig
 from fb_core.inpainter import Fillerbuster
+from fb_core.machine.resources import usable_cores
 from fb_core.memory.budget import GIB, SIDE_MULTIPLE
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.networks.weights import without_weights
@@ -116,13 +118,29 @@ def _flops(config: VAEConfig, size: int) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=4)
+@torch.no_grad()
 def _rate(device: str, dtype: torch.dtype) -> float:
-    """Floating-point operations per second of a large product, the best of a few."""
+    """Floating-point operations per second of a large product, the best of a few, in the share of the processor that is
+    free.
+
+    A trial is too short to tell that share: it falls into one slice of the scheduler or between two.
+    """
+    own = torch.device(device).type == "cpu"
+    clock = time.thread_time if own else time.perf_counter
     left, right = (torch.ones(512, 512, device=device, dtype=dtype) for _ in range(2))
-    best, began = float("inf"), time.perf_counter()
-    while best == float("inf") or time.perf_counter() - began < _TRIAL_SECONDS:
-        start = time.perf_counter()
+    best, began = float("inf"), clock()
+    while best == float("inf") or clock() - began < _TRIAL_SECONDS:
+        start = clock()
         product = left @ right
         float(product[0, 0])  # waits for a GPU
-        best = min(best, time.perf_counter() - start)
-    return 2 * 512**3 / best
+        best = min(best, max(clock() - start, 1e-6))
+    return 2 * 512**3 / best / (_crowd(torch.get_num_threads()) if own else 1.0)
+
+
+def _crowd(threads: int) -> float:
+    """By how much so many threads are slowed down by what else the machine does; 1 where it does not tell."""
+    try:
+        busy = os.getloadavg()[0]
+    except (AttributeError, OSError):  # Windows
+        busy = 0.0
+    return max(1.0, (busy + threads) / max(usable_cores(), threads))

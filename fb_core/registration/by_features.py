@@ -35,7 +35,8 @@ def recover_with_features(
         image, mask = photo.load_with_mask(LONGEST_SIDE)
         shrink = image.shape[2] / photo.size[1]
         told = None if photo.focal_prior is None else photo.focal_prior * shrink
-        features.append(features_of(image, mask, focal=told, lens=lens_of(photo), posed=photo.camera is not None))
+        lens = {"lens": lens_of(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
+        features.append(features_of(image, mask, focal=told, **lens))
     found = chain(features, on_progress=on_progress)
     whole = [
         camera if camera is None else camera.scaled(photo.size[1], photo.size[0])

@@ -173,8 +173,7 @@ class Equations:
 
         cameras = matrix(of_camera, columns, width)
         points = matrix(of_point, 3 * bundle.point_of[:, None] + np.arange(3), 3 * len(bundle.points))
-        squares = np.zeros((len(bundle.points), 3, 3))
-        np.add.at(squares, bundle.point_of, np.einsum("oki,okj->oij", of_point, of_point))
+        squares = _squares(bundle, of_point)
         own = (cameras.T @ cameras).toarray()
         gradient = cameras.T @ misses.ravel()
         off, prior = lenses.off(bundle), lenses.precisions(bundle)
@@ -228,6 +227,29 @@ class Equations:
             self.gradient - eliminated @ self.point_gradient.ravel(),
             inverse,
         )
+
+
+def settled(bundle: Bundle, *, steps: int) -> tuple[Bundle, Float[np.ndarray, "p 3 3"]]:
+    """Only the points moved to where their observations agree best, in Newton steps, and their covariance where an
+    observation's deviation is its tolerance.
+    """
+    for step in range(steps + 1):
+        _, of_point, misses = _jacobians(bundle)
+        squares = _squares(bundle, of_point)
+        ridge = 1e-9 * np.maximum(np.einsum("pii->p", squares), 1e-12)
+        covariance = np.linalg.inv(squares + ridge[:, None, None] * np.eye(3))
+        if step < steps:
+            gradient = np.zeros((len(bundle.points), 3))
+            np.add.at(gradient, bundle.point_of, np.einsum("oki,ok->oi", of_point, misses))
+            moved = bundle.points - np.einsum("pij,pj->pi", covariance, gradient)
+            bundle = dataclasses.replace(bundle, points=moved)
+    return bundle, covariance
+
+
+def _squares(bundle: Bundle, of_point: Float[np.ndarray, "o 2 3"]) -> Float[np.ndarray, "p 3 3"]:
+    squares = np.zeros((len(bundle.points), 3, 3))
+    np.add.at(squares, bundle.point_of, np.einsum("oki,okj->oij", of_point, of_point))
+    return squares
 
 
 def _jacobians(bundle: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,8 +15,11 @@ from fb_core.geometry.features.pairs import PhotoFeatures
 
 FOCAL_GUESS = 1.2
 """Focal length in longer sides where nothing tells more: a normal lens (43 mm on film), the customary start."""
-_FOCAL_TOLD, _FOCAL_GUESSED = 0.02, 0.5  # deviations of the logarithm
-_SPREAD = 0.1  # logarithm of the largest over the smallest focal length of photos that were not taken with one lens
+FOCAL_GUESSED = 0.5
+"""Deviation of the logarithm of focal lengths that nobody tells."""
+_FOCAL_TOLD = 0.02  # the same of those that are told
+ONE_LENS = 0.1
+"""Logarithm of the largest over the smallest focal length of photos beyond which they were not taken with one lens."""
 _GAIN = 0.015  # share of all matches
 SAME_LENS = (0.25, 0.1, 0.03)
 """Logarithms within which focal lengths of photos of one lens may be found, where little fixes them; the first that
@@ -92,7 +95,7 @@ class LensGuess:
         """The share of matches that this guess must explain beyond another one to be preferred."""
         if len(self.focal) > len(before.focal):
             spread = float(np.ptp(np.log(self.focal[~self.fixed])))
-            return max(_GAIN, min(2 * _GAIN, 0.4 / len(self.lens))) if spread > _SPREAD else math.inf
+            return max(_GAIN, min(2 * _GAIN, 0.4 / len(self.lens))) if spread > ONE_LENS else math.inf
         return _GAIN if self.bends > before.bends else -_GAIN
 
     def merged(self, within: float) -> LensGuess:
@@ -105,6 +108,21 @@ class LensGuess:
         group = np.empty(len(order), dtype=int)
         group[order] = np.concatenate([[0], np.cumsum(apart)])
         return self._regrouped(np.unique(group[self.lens], return_inverse=True)[1], believed=self.believed)
+
+    def with_photo(self, photo: int, *, lens: int | None, focal: float) -> LensGuess:
+        """With another lens for one photo: one of those here, or one of its own with such a focal length (pixels),
+        about which no tag is believed.
+        """
+        chosen, grown = self.lens.copy(), self
+        if lens is None:
+            rows = np.append(np.arange(len(self.focal)), self.lens[photo])
+            names = ("focal", "bend", "told", "believed", "tagged", "family", "fixed")
+            grown = dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+            grown.focal[-1], grown.believed[-1] = focal, False
+            lens = len(self.focal)
+        chosen[photo] = lens
+        grown = dataclasses.replace(grown, lens=chosen)
+        return grown._regrouped(np.unique(chosen, return_inverse=True)[1], believed=grown.believed)
 
     def _regrouped(self, lens: Int[np.ndarray, " n"], *, believed: Bool[np.ndarray, " l"]) -> LensGuess:
         members = [self.lens[lens == number] for number in range(int(lens.max()) + 1)]
@@ -120,7 +138,7 @@ class LensGuess:
         bent ones.
         """
         notes, side = [], max(sides)
-        lies = np.flatnonzero(self.tagged & ~self.believed & (np.abs(np.log(self.focal / self.told)) > _SPREAD / 2))
+        lies = np.flatnonzero(self.tagged & ~self.believed & (np.abs(np.log(self.focal / self.told)) > ONE_LENS / 2))
         if len(lies):
             worst = lies[int(np.argmax(np.abs(np.log(self.focal[lies] / self.told[lies]))))]
             off = f"{self.told[worst] / side:.2f} longer sides told, {self.focal[worst] / side:.2f} found"
@@ -147,7 +165,7 @@ class LensGuess:
         free = ~self.fixed[chosen] & focal_free
         return Lenses(
             told=self.told[chosen],
-            deviation=np.where(self.believed[chosen], _FOCAL_TOLD, _FOCAL_GUESSED),
+            deviation=np.where(self.believed[chosen], _FOCAL_TOLD, FOCAL_GUESSED),
             focal_free=free,
             bend_free=free[:, None] & (np.arange(2) < self.bends),
         )

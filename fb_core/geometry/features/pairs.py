@@ -43,6 +43,8 @@ class PhotoFeatures:
     """In pixels, where it is known."""
     lens: str
     """Photos with the same text share one focal length (in pixels of this size), unless they say otherwise."""
+    same_lens: bool = False
+    """Whether photos of this lens are known to share it (the device is told, or a film), not only to have one size."""
     known: bool = False
     """Whether the focal length stands and the lens is straight: the photo's camera is known."""
 
@@ -63,6 +65,7 @@ def features_of(
     *,
     focal: float | None,
     lens: str,
+    same_lens: bool = False,
     posed: bool = False,
 ) -> PhotoFeatures:
     """Features of a photo, RGB in [0, 1]; `known` is 1 where it may be used. The camera of a `posed` photo is known."""
@@ -78,7 +81,14 @@ def features_of(
     small_image, share = resampled(image, everything if known is None else known, shrunk)
     coarse = detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
     return PhotoFeatures(
-        places=places, descriptors=descriptors, coarse=coarse, size=size, focal=focal, lens=lens, known=posed
+        places=places,
+        descriptors=descriptors,
+        coarse=coarse,
+        size=size,
+        focal=focal,
+        lens=lens,
+        same_lens=same_lens,
+        known=posed,
     )
 
 

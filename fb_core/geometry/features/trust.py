@@ -16,7 +16,9 @@ from jaxtyping import Bool, Float, Int
 
 from fb_core.geometry.features.bundle_adjustment import Bundle, Equations, Lenses
 
-_PESSIMISM = 3.0  # observations err together (the same tracks, the same lens), which their scatter does not tell
+PESSIMISM = 3.0
+"""Observations err together (the same tracks, the same lens), which their scatter does not tell."""
+_RAYLEIGH = 1.177  # median of the distribution of distances, in deviations per axis
 _LEAST_SIGMA = 0.1  # tolerances; places of features are no better
 _MOST_TURN_DEGREES, _MOST_SHIFT = (
     1.0,
@@ -50,9 +52,7 @@ def deviations_of(bundle: Bundle, lenses: Lenses) -> Deviations:
     count = len(bundle.rotations)
     reduced = Equations.of(bundle, lenses).reduced()[0]
     relative = np.linalg.norm(bundle.misses(), axis=1) / bundle.tolerance
-    sigma = (
-        max(_LEAST_SIGMA, float(np.median(relative)) / 1.177) * _PESSIMISM
-    )  # 1.177: median of Rayleigh's distribution
+    sigma = sigma_of(relative)
     centers = -np.einsum("nji,nj->ni", bundle.rotations, bundle.shifts)
     to_world = _to_world(bundle)
     within = np.diag(
@@ -69,6 +69,11 @@ def deviations_of(bundle: Bundle, lenses: Lenses) -> Deviations:
         (own + own.T) / 2 + np.trace(information[: 6 * count, : 6 * count]) / count * directions @ directions.T
     )
     return _against_the_best(covariance, gauge, centers, bundle.lens)
+
+
+def sigma_of(relative: Float[np.ndarray, " o"]) -> float:
+    """The deviation, per axis and in tolerances, that misses of so many tolerances are believed to have."""
+    return max(_LEAST_SIGMA, float(np.median(relative)) / _RAYLEIGH) * PESSIMISM
 
 
 def _to_world(bundle: Bundle) -> Float[np.ndarray, "d d"]:
@@ -166,6 +171,14 @@ def agreeing_shares(misses: dict[tuple[int, int], Float[np.ndarray, " _"]], coun
             good[index] += (each <= _ON_THE_LINE).sum()
             total[index] += len(each)
     return np.where(total > 0, good / np.maximum(total, 1), math.nan).tolist()
+
+
+def outlying(relative: Float[np.ndarray, " o"], sigma: float) -> str:
+    """What speaks against a camera whose observations miss by more than deviations were reckoned with (both in
+    tolerances); empty if nothing does.
+    """
+    own = float(np.median(relative)) / _RAYLEIGH
+    return "" if own <= sigma else f"its features miss their points {own / sigma * PESSIMISM:.0f} times as far as usual"
 
 
 def doubt(found: Deviations, camera: int, agreeing: float) -> str:

@@ -14,7 +14,7 @@ from helpers.tiny_models import tiny_model
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fb_core.completion import fly_through
+from fb_core.completion import duration, fly_through
 from fb_core.completion.duration import expected_seconds
 from fb_core.completion.fly_through import choose_context, find_cameras, generate, plan_passes, room_beside
 from fb_core.data.photos.photo import Photo
@@ -217,3 +217,12 @@ def test_more_work_is_expected_to_take_longer(model):
     assert once > 0
     assert seconds(steps=20) > 2 * once * 0.5 and seconds(views=32) > 2 * once and seconds(side=64) > 2 * once
     assert seconds(guidance_unknown=7.0) > once and seconds(window=4, rounds=8) > once
+
+
+@pytest.mark.parametrize(
+    ("busy", "threads", "cores", "slower"), [(0.0, 1, 2, 1.0), (0.0, 8, 2, 1.0), (7.0, 1, 2, 4.0), (6.0, 2, 16, 1.0)]
+)
+def test_a_busy_machine_is_expected_to_take_longer(monkeypatch, busy, threads, cores, slower):
+    monkeypatch.setattr(duration.os, "getloadavg", lambda: (busy, busy, busy), raising=False)
+    monkeypatch.setattr(duration, "usable_cores", lambda: cores)
+    assert duration._crowd(threads) == slower

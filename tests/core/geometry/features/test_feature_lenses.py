@@ -101,6 +101,24 @@ def test_lenses_of_which_nothing_is_told_have_their_own_focal_lengths(factors: l
     assert any("focal lengths" in note for note in found.notes)
 
 
+@pytest.mark.parametrize(("zoom", "told"), [(0.75, None), (1.8, 500.0)])
+def test_one_zoomed_photo_before_a_wall_is_not_one_from_nearer_by(zoom: float, told: float | None):
+    """A bundle adjustment moves the camera and the wall's points until nearly everything agrees."""
+    views, points = wall_views(6)
+    truth = zoomed(views, [1.0, 1.0, zoom, 1.0, 1.0, 1.0])
+    found = chain(photos_of(truth, points, told=told, noise=0.2))
+    assert not false_oks(found, truth), (found.reasons, found.notes)
+    assert [found.trusted[index] for index in (0, 1, 3, 4, 5)] == [True] * 5, found.reasons
+    assert [focal_lengths(found)[index] for index in (0, 1, 3, 4, 5)] == pytest.approx([500.0] * 5, rel=0.01)
+
+
+def test_a_zoomed_photo_that_nothing_else_confirms_makes_a_pair_of_three_doubtful():
+    """Before a wall two of three photos fit together whatever one of them was zoomed by."""
+    views, points = wall_views(3)
+    found = chain(photos_of(zoomed(views, [1.0, 1.5, 1.0]), points, told=500.0, noise=0.6))
+    assert not false_oks(found, views)
+
+
 @pytest.mark.parametrize("bend", [(-0.25, 0.05), (-0.1, 0.0), (0.08, 0.0)])
 def test_a_lens_that_bends_is_found_and_its_focal_length_is_right(bend: tuple[float, float]):
     truth = around(5, focal=430.0, arc_degrees=60.0)
