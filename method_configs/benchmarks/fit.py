@@ -251,7 +251,7 @@ def _stir_all(model: FillerbusterSplatModel) -> None:
     """The published noise: on every Gaussian, whether the view saw it or not."""
     import torch
 
-    from fb_nerfstudio.splats.mcmc import position_noise
+    from fb_nerfstudio.splats.strategies.mcmc import position_noise
 
     with torch.no_grad():
         rate = model.optimizers["means"].param_groups[0]["lr"]

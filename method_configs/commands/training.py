@@ -25,7 +25,8 @@ from fb_core.training.dry_run import Cost, measure
 from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
 from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import Group, joined
-from fb_core.training.run.loop import EngineConfig, OnProgress
+from fb_core.training.run.loop import OnProgress
+from fb_core.training.run.options import EngineConfig
 from fb_core.training.run.progress_log import ProgressLog
 from method_configs.commands.train_options import TrainOptions
 from method_configs.presets import PRESETS

@@ -18,7 +18,7 @@ from fb_core.data.training.sequences import PoolConfig, TaskConfig
 from fb_core.networks.transformer.dit import DiTConfig
 from fb_core.networks.vae import VAEConfig
 from fb_core.training.recipe import Recipe
-from fb_core.training.run.loop import LoopConfig
+from fb_core.training.run.options import LoopConfig
 from fb_core.training.stages.dit_stage import DiTLossConfig
 from fb_core.training.stages.vae_stage import VAELossConfig
 from method_configs import environment

@@ -20,7 +20,9 @@ from fb_core.networks.vae import VAEConfig
 from fb_core.sampling import SamplingConfig
 from fb_core.training.recipe import Recipe
 from fb_core.training.run.distributed import Group, joined, left_at_once, whole
-from fb_core.training.run.loop import EngineConfig, LoopConfig, Run, Stage, row_generator
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import EngineConfig, LoopConfig
+from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.dit_stage import DiTLossConfig
 from fb_core.training.stages.vae_stage import VAELossConfig
 
