@@ -23,10 +23,11 @@ from torch import Tensor
 from fb_core.evaluation.metrics.lazy_lpips import LazyLpips
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.normals import normal_picture, normals_from_depth
+from fb_core.geometry.rotations import flip_axes
 from fb_core.masks import resampled
 from fb_core.splatting.normal_losses import blended_normals, gaussian_normals
 from fb_core.splatting.spherical_harmonics import sh_colors
-from fb_nerfstudio.bridge import batch_image, flip_axes
+from fb_nerfstudio.bridge import batch_image
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.drawn_camera import one_pinhole, shrunk, with_unit_axes
 from fb_nerfstudio.splats.gaussians import colors_of, evenly_chosen, first_gaussians, gaussians_at, require_points

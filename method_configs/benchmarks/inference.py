@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.devices import chosen_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     from fb_core.evaluation.results import Report
@@ -138,9 +139,9 @@ def timed(model: Fillerbuster, views: int, size: int, steps: int, seed: int) -> 
 
 def draw(report: Report, path: Path) -> None:
     """Seconds over the number of views, a curve for each size and number of steps, and the paper's beside them."""
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = _axes("seconds")
+    figure, axes = new_axes("seconds")
     for size, steps in dict.fromkeys((row["size"], row["steps"]) for row in report.rows):
         rows = [row for row in report.rows if (row["size"], row["steps"]) == (size, steps)]
         label = f"{size} pixels, {steps} steps, {rows[0]['how']}"
@@ -151,4 +152,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("views")
     axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 from fb_core.files.whole import whole_file
 
 if TYPE_CHECKING:
-    import torch
-
     from fb_core.evaluation.results import Report
 
 _logger = logging.getLogger(__name__)
@@ -80,23 +78,6 @@ class TableFiles:
                 json_format.dumps({"asked": question, "measured": measured}, indent=1) + "\n", encoding="utf-8"
             )
         return measured
-
-
-def chosen_device(name: str | None) -> torch.device:
-    """The device of this name; without one a GPU if there is one. Raises ValueError for one that torch does not have
-    here.
-    """
-    import torch
-
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ValueError(
-            f"device: expected one that this machine has, such as cpu, got {name!r}; leave it out to choose"
-        ) from error
-    return torch.device(name)
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -21,10 +21,11 @@ from pathlib import Path
 import torch
 
 from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
+from fb_core.machine.devices import chosen_device
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, run_stage
 from fb_core.training.run.checkpoints import read_state
-from fb_core.training.run.distributed import Group, joined
+from fb_core.training.run.distributed import Group, in_group
 from fb_core.training.run.loop import OnProgress
 from fb_core.training.run.options import EngineConfig
 from fb_core.training.run.progress_log import ProgressLog
@@ -75,7 +76,7 @@ def train_preset(preset: str, output: Path, options: TrainOptions = TrainOptions
     engine = dataclasses.replace(recipe.engine, **options.engine_changes)
     if not options.dry_run:
         _require_own_model_or_free(output, options.start_from)  # before days of training, not after them
-    with joined(_device(options.device)) as (group, where):
+    with in_group(chosen_device(options.device)) as (group, where):
         training = _Training(recipe=recipe, output=output, options=options, engine=engine, device=where, group=group)
         if options.dry_run:
             for name in training.stages:
@@ -173,19 +174,6 @@ def _steps_done(folder: Path) -> int:
         folder.name == "dit" or (folder / "spread.json").exists()
     )  # killed while measuring its latents
     return read_state(path, mapped=True)["step"] if complete else 0
-
-
-def _device(name: str | None) -> torch.device:
-    """The device asked for, checked before any work; by default the first GPU, or the CPU where there is none."""
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {name!r}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {name!r} was asked for, but torch finds no GPU on this machine; use cpu")
-    return device
 
 
 def _cost_in_words(stage: str, cost: Cost) -> str:

@@ -10,7 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from method_configs.benchmarks.table_files import TableFiles, chosen_device
+from fb_core.machine.devices import chosen_device
+from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
     import torch
@@ -204,7 +205,7 @@ def draw(report: Report, path: Path) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    from method_configs.benchmarks.command import _save
+    from method_configs.benchmarks.figures import save_figure
 
     parts = list(dict.fromkeys(row["part"] for row in report.rows))
     figure, panels = pyplot.subplots(
@@ -219,4 +220,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel("squared error")
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

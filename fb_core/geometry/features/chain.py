@@ -22,7 +22,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of, one_place
 from fb_core.geometry.features.lenses import FOCAL_GUESS, SAME_LENS, LensGuess
-from fb_core.geometry.features.pairs import Pair, PhotoFeatures, match_pairs, rays_of, verified_pair
+from fb_core.geometry.features.pairs import Pair, PhotoFeatures, match_pairs, rays_through, verified_pair
 from fb_core.geometry.features.panorama import panorama_of
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
 from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses
@@ -260,7 +260,7 @@ class _Chain:
             return
         tracks, compact = np.unique(self.track[mine], return_inverse=True)
         rotations = self.rotations[self.owner[mine]]
-        directions = np.einsum("oji,oj->oi", rotations, rays_of(plane))
+        directions = np.einsum("oji,oj->oi", rotations, rays_through(plane))
         centers = -np.einsum("oji,oj->oi", rotations, self.shifts[self.owner[mine]])
         error = float(np.degrees(np.median(2 * self.tolerance[mine] / self._focal_of(mine))))
         points, sound = nearest_points(

@@ -26,7 +26,7 @@ from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.vae import Resnet
 from fb_core.training.run.averaged import Averaged
 from fb_core.training.run.checkpoints import Checkpoints
-from fb_core.training.run.distributed import ALONE, Group, averaged_if, averaging, shard, spread, whole
+from fb_core.training.run.distributed import ALONE, Group, averaged_if, averaging, shard, sharded_like, whole
 from fb_core.training.run.optimizers import clip_gradients, load_optimizer, make_optimizers
 from fb_core.training.run.options import EngineConfig, LoopConfig
 from fb_core.training.run.progress_log import ProgressLog
@@ -314,7 +314,7 @@ class Run:
         for optimizer, values in zip(self.optimizers, saved, strict=True):
             load_optimizer(optimizer, values)
         like = network.state_dict()
-        self.average.values = {name: spread(value, like[name]) for name, value in state["average"].items()}
+        self.average.values = {name: sharded_like(value, like[name]) for name, value in state["average"].items()}
         self.average.updates = state["average_updates"]
         self.step, self.seconds, self.waited = state["step"], state["seconds"], state.get("waited", 0.0)
         self.smoothed = state["smoothed"]
@@ -325,7 +325,7 @@ def _load(network: nn.Module, state: dict[str, Tensor]) -> None:
     """Load whole weights into a network that may be spread over processes."""
     like = network.state_dict()
     network.load_state_dict(
-        {name: spread(value, like[name]) if name in like else value for name, value in state.items()}
+        {name: sharded_like(value, like[name]) if name in like else value for name, value in state.items()}
     )
 
 

@@ -33,6 +33,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.camera_paths import PATHS, path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
 from fb_core.inpainter import Fillerbuster
+from fb_core.machine.clock import Clock
 from fb_core.machine.resources import peak_memory_bytes
 from method_configs.commands.complete.forecast import forecast
 from method_configs.commands.complete.options import CHECKED, CompleteOptions, Plan, pose_sampling
@@ -67,7 +68,7 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     source, output = source.absolute(), output.absolute()
     target = _target(source, output, options, overwrite)
     target.check()
-    clock = _Clock()
+    clock = Clock()
     with clock.stage("reading"):
         job = _read(source, options)
     target = _with_pictures(target, job.photos)
@@ -244,7 +245,7 @@ def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | Non
 
 
 def _work(
-    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path | None = None
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock, work: Path | None = None
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
     """Cameras, then new views; what the report is to say of these. With a folder to work in, a scene and its film."""
     if work is not None:
@@ -303,7 +304,7 @@ def _work(
     return found, new, told
 
 
-def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock) -> FoundCameras:
+def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock) -> FoundCameras:
     """And say what was found."""
     sampling = None if model is None else pose_sampling(model, options)
     with _bars() as on_progress, clock.stage("cameras"):
@@ -321,7 +322,7 @@ def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None
 
 
 def _work_on_scene(
-    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock, work: Path
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
     """Cameras, splats, new views where they are needed, a film; what an earlier try has kept is not done again."""
     from method_configs.commands.complete.scene import SceneJob, complete_with_splats
@@ -403,21 +404,6 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[what], completed=done, total=total)
 
         yield report
-
-
-class _Clock:
-    """Seconds of each stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = round(time.perf_counter() - began, 2)
 
 
 def _peak_memory_gib() -> float:
