@@ -10,19 +10,11 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import flip_axes
 
 # nerfstudio undistorts these into pinhole images when it caches a dataset, but leaves type and coefficients as they
 # were.
 _PINHOLE_AFTER_CACHING = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624)
-
-
-def flip_axes(camera_to_world: Float[Tensor, "*n 3 4"]) -> Float[Tensor, "*n 3 4"]:
-    """OpenGL camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward), or back: it is its own
-    inverse.
-
-    Negates the second and third column; centres stay. Exact in floating point, differentiable.
-    """
-    return camera_to_world * camera_to_world.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def to_pinholes(cameras: Cameras) -> Pinholes:

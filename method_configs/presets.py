@@ -12,7 +12,7 @@ from fb_core.networks.transformer.dit import DiTConfig
 from fb_core.networks.vae import IMAGE_VAE, RAYMAP_VAE, VAEConfig
 from fb_core.sampling import SamplingConfig
 from fb_core.training.recipe import Recipe
-from fb_core.training.run.loop import EngineConfig, LoopConfig
+from fb_core.training.run.options import EngineConfig, LoopConfig
 from fb_core.training.stages.dit_stage import DiTLossConfig
 from fb_core.training.stages.vae_stage import VAELossConfig
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.context_views import nearest_context
-from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, lens_of
+from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, focal_of_new_views
 from fb_core.completion.results.completed_views import ANCHOR, DENSIFY, REQUESTED, CompletedViews
 from fb_core.geometry.cameras import Pinholes
 
@@ -180,7 +180,7 @@ def plan_request(
     """
     size, aspect = scene.size if bank is None else bank.cameras.width, 1.0
     if isinstance(request, CompleteFrom):
-        focal = lens_of(cameras, scene.context, size)
+        focal = focal_of_new_views(cameras, scene.context, size)
         new = fan_from(request, scene, focal=focal, size=size)
         taken = [config.densify_rounds] if bank is None else [config.densify_rounds, *bank.rounds]
         number = 1 + max(taken)  # smaller ones are the automatic rounds'

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 _UNLIMITED = 2**62  # version 1 writes its largest number for "no limit"
 _KIB = 1024
@@ -41,30 +41,6 @@ def usable_cores() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return max(1, len(affinity(0)) if affinity is not None else os.cpu_count() or 1)
-
-
-def usable_device(name: str | None) -> torch.device:
-    """The device of this name, asked before any work; without a name the first GPU, or the CPU where there is none.
-
-    Raises ValueError for one that torch does not know, that this machine lacks, or that holds no numbers (meta).
-    """
-    import torch
-
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {name!r}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {name!r} was asked for, but torch finds no GPU on this machine; use cpu")
-    try:
-        torch.ones(1, device=device).item()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ValueError(
-            f"device: expected one that this machine has, such as cpu, got {name!r}; leave it out to choose"
-        ) from error
-    return device
 
 
 def peak_memory_bytes() -> int:

@@ -13,7 +13,7 @@ from fb_core.data.photos.straight_photos import straightened
 from fb_core.geometry.features.chain import FeatureCameras, chain
 from fb_core.geometry.features.pairs import features_of
 from fb_core.geometry.similarity import Similarity
-from fb_core.registration.by_raymaps import lens_of
+from fb_core.registration.by_raymaps import lens_in_words
 
 LONGEST_SIDE = 1024
 """Pixels at which features are looked for."""
@@ -35,7 +35,7 @@ def recover_with_features(
         image, mask = photo.load_with_mask(LONGEST_SIDE)
         shrink = image.shape[2] / photo.size[1]
         told = None if photo.focal_prior is None else photo.focal_prior * shrink
-        lens = {"lens": lens_of(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
+        lens = {"lens": lens_in_words(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
         features.append(features_of(image, mask, focal=told, **lens))
     found = chain(features, on_progress=on_progress)
     whole = [

@@ -232,7 +232,7 @@ def _solved(photos: Sequence[Photo], squares: Sequence[Square], raymaps: Float[T
     groups: dict[str, list[int]] = {}
     for index, photo in enumerate(photos):
         if photo.camera is None and there[index]:
-            groups.setdefault(lens_of(photo), []).append(index)
+            groups.setdefault(lens_in_words(photo), []).append(index)
     for members in groups.values():
         found = recover_cameras(
             raymaps[members],
@@ -260,7 +260,7 @@ def _told_focal(photo: Photo, square: Square) -> float:
     return math.nan if photo.focal_prior is None else photo.focal_prior * square.side / min(photo.size)
 
 
-def lens_of(photo: Photo) -> str:
+def lens_in_words(photo: Photo) -> str:
     """What photos of one focal length have in common. Where nothing is known of the device, photos of one size count as
     one device's.
     """

@@ -14,7 +14,8 @@ from fb_core.machine.precision import resolved
 from fb_core.memory.live_bytes import LiveBytes
 from fb_core.training.recipe import Recipe, make_stage
 from fb_core.training.run.distributed import ALONE, Group, own_part
-from fb_core.training.run.loop import EngineConfig, Run
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import EngineConfig
 
 _MANY = 10**9
 

@@ -28,7 +28,8 @@ from fb_core.networks.weights import Network
 from fb_core.sampling import SamplingConfig
 from fb_core.training.run.checkpoints import Checkpoints, read_state
 from fb_core.training.run.distributed import ALONE, Group
-from fb_core.training.run.loop import EngineConfig, LoopConfig, OnProgress, OnSheet, Run
+from fb_core.training.run.loop import OnProgress, OnSheet, Run
+from fb_core.training.run.options import EngineConfig, LoopConfig
 from fb_core.training.sample_sheets import reconstruction_sheet, room_sheet
 from fb_core.training.stages.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
 from fb_core.training.stages.linear_start import start_linear

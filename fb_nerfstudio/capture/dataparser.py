@@ -38,7 +38,7 @@ from fb_core.data.capture.frames import Capture, Frame
 from fb_core.data.capture.points import read_points
 from fb_core.data.capture.transforms_json import DISTORTION_KEYS
 from fb_core.data.capture.undistort import FISHEYE_MODELS, is_too_wide, straight_camera
-from fb_nerfstudio.bridge import flip_axes
+from fb_core.geometry.rotations import flip_axes
 from fb_nerfstudio.capture.pictures import SMALLER_BY, WIDE_LENSES, Lens
 
 _ONE_PLACE = 1e-6  # of the largest coordinate, in single precision: what it cannot tell apart

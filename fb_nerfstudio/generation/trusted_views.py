@@ -30,7 +30,7 @@ def shell_depth(shell: Shell, cameras: Pinholes) -> Float[Tensor, "n h w"]:
     directions = nearby.directions()
     starts = nearby.centers[:, None, None].expand_as(directions)
     distance = intersect(around, starts.reshape(-1, 3), directions.reshape(-1, 3)).reshape(directions.shape[:3])
-    return (distance * torch.einsum("nhwc,nc->nhw", directions, nearby.rotations[:, :, 2])).float()
+    return (distance * nearby.cosines()).float()
 
 
 def surroundings_of(shell: Shell, splats: TrainedSplats | None) -> Callable[[Pinholes], Surroundings]:

@@ -18,8 +18,8 @@ from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.data.capture.captures import read_capture
 from fb_core.data.capture.frames import Capture
 from fb_core.data.capture.point_cloud import Points
+from fb_core.geometry.rotations import flip_axes
 from fb_core.geometry.similarity import Similarity
-from fb_nerfstudio.bridge import flip_axes
 from fb_nerfstudio.capture.dataparser import without_open3d
 
 _FAINT, _MOST_POINTS = 0.05, 100_000

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -37,6 +39,47 @@ def gaussians_at(
         "features_rest": points.new_zeros(len(points), num_sh_bases(sh_degree) - 1, 3),
         "opacities": torch.logit(points.new_full((len(points), 1), opacity)),
     }
+
+
+def first_gaussians(
+    seeds: tuple[Tensor, Tensor] | None, *, random: tuple[int, float], limit: int | None, sh_degree: int
+) -> dict[str, Tensor]:
+    """What a training starts with: Gaussians at the scene's points, or at random ones where there are none.
+
+    Args:
+        seeds: points [m, 3] and their colours in 8 bits; nerfstudio allows points without colours.
+        random: how many random points, and the side of their cube.
+        limit: most Gaussians; of more points an evenly spread part is taken.
+        sh_degree: of the harmonics.
+    """
+    if seeds is not None and len(seeds[0]) > 0:
+        points, colors = seeds[0].float(), seeds[1].float() / 255.0
+        if len(colors) != len(points):
+            colors = torch.rand(len(points), 3)
+    else:
+        count, side = random
+        points, colors = random_points(count if limit is None else min(count, limit), side)
+    chosen = evenly_chosen(len(points), len(points) if limit is None else limit)
+    return gaussians_at(points[chosen], colors[chosen], sh_degree=sh_degree)
+
+
+def colors_of(splats: Mapping[str, Tensor], degree: int) -> tuple[Tensor, int | None]:
+    """Colours in [0, 1] (of Gaussians without harmonics), or harmonics and the degree up to which they are to be
+    evaluated.
+    """
+    if splats["features_rest"].shape[1] == 0:
+        return splats["features_dc"].sigmoid(), None
+    return torch.cat([splats["features_dc"][:, None], splats["features_rest"]], dim=1), degree
+
+
+def require_points(points: Tensor, colors: Tensor) -> None:
+    """Raises ValueError when points and colors are not two [m, 3] of finite values."""
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
+        raise ValueError(
+            f"points and colors: expected two shapes [m, 3], got {list(points.shape)} and {list(colors.shape)}"
+        )
+    if not bool(points.isfinite().all() and colors.isfinite().all()):
+        raise ValueError("points and colors: expected finite values, got NaN or infinity; drop those points first")
 
 
 def random_points(count: int, side: float) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:

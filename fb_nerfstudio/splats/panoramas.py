@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from fb_core.files.faults import Refused
@@ -33,10 +34,14 @@ _FACES = (  # right, up, backward in the camera's own axes (OpenGL)
 )
 
 
-def is_panorama(camera: Cameras) -> bool:
-    """Whether a camera sees no perspective picture. Fisheye cameras of captures, whose pictures have been straightened,
-    keep their type and their coefficients; those of camera paths have none.
+def is_panorama(camera: Cameras | RayBundle) -> bool:
+    """Whether this is one camera that sees no perspective picture.
+
+    Fisheye cameras of captures, whose pictures have been straightened, keep their type and their coefficients; those of
+    camera paths have none.
     """
+    if not isinstance(camera, Cameras) or camera.camera_to_worlds.numel() != 12:
+        return False
     kind = int(camera.camera_type.reshape(-1)[0])
     lens = camera.distortion_params
     straightened = kind == CameraType.FISHEYE.value and lens is not None and bool((lens != 0).any())

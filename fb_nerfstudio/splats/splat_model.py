@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from gsplat.strategy.ops import remove
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components import renderers
@@ -23,26 +21,26 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 
 from fb_core.evaluation.metrics.lazy_lpips import LazyLpips
-from fb_core.files.faults import Refused
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.normals import normal_picture, normals_from_depth, normals_of_picture
+from fb_core.geometry.normals import normal_picture, normals_from_depth
+from fb_core.geometry.rotations import flip_axes
 from fb_core.masks import resampled
-from fb_core.splatting import photometric
-from fb_core.splatting.normal_losses import alignment_loss, blended_normals, gaussian_normals, total_variation
+from fb_core.splatting.normal_losses import blended_normals, gaussian_normals
 from fb_core.splatting.spherical_harmonics import sh_colors
-from fb_nerfstudio.bridge import batch_image, flip_axes, to_pinholes
+from fb_nerfstudio.bridge import batch_image
 from fb_nerfstudio.splats.backend import render_splats
-from fb_nerfstudio.splats.densification import CappedStrategy, append_rows
-from fb_nerfstudio.splats.gaussians import evenly_chosen, gaussians_at, random_points
-from fb_nerfstudio.splats.mcmc import CappedMCMC, penalize
+from fb_nerfstudio.splats.drawn_camera import one_pinhole, shrunk, with_unit_axes
+from fb_nerfstudio.splats.gaussians import colors_of, evenly_chosen, first_gaussians, gaussians_at, require_points
 from fb_nerfstudio.splats.panoramas import draw_panorama, is_panorama
+from fb_nerfstudio.splats.strategies.choice import strategy_of
+from fb_nerfstudio.splats.strategies.densification import append_rows
+from fb_nerfstudio.splats.strategies.mcmc import penalize
+from fb_nerfstudio.splats.supervision import Supervision, empty_outputs, needles
 
 logger = logging.getLogger(__name__)
 
 _VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Viser's default grey: what stands behind renders where training uses random backgrounds."""
-_MOST_WITHOUT_LIMIT = 1_000_000
-"""Where MCMC stops growing without a limit: it grows until one is reached (gsplat's default)."""
 _FINAL_STEP = 30000
 """The step a restored model pretends to be at until training sets it: harmonics and resolution are final then."""
 
@@ -111,8 +109,11 @@ class FillerbusterSplatModel(SplatfactoModel):
         start).
         """
         config = self.config
+        limit, random = config.max_gaussians, (config.num_random, config.random_scale)
+        seeds = None if config.random_init else self.seed_points
+        gaussians = first_gaussians(seeds, random=random, limit=limit, sh_degree=config.sh_degree)
         self.gauss_params = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(values) for name, values in self._initial_gaussians().items()}
+            {name: torch.nn.Parameter(values) for name, values in gaussians.items()}
         )
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         if config.use_bilateral_grid:
@@ -127,49 +128,8 @@ class FillerbusterSplatModel(SplatfactoModel):
             else get_color(config.background_color)
         )
         self.lpips = LazyLpips()
-        self.strategy = self._make_strategy()
+        self.strategy = strategy_of(config, views=self.num_train_data)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-
-    def _initial_gaussians(self) -> dict[str, Tensor]:
-        config = self.config
-        limit = config.max_gaussians
-        if self.seed_points is not None and len(self.seed_points[0]) > 0 and not config.random_init:
-            points, colors = self.seed_points[0].float(), self.seed_points[1].float() / 255.0
-            if len(colors) != len(points):  # nerfstudio allows points without colours
-                colors = torch.rand(len(points), 3)
-        else:
-            points, colors = random_points(
-                config.num_random if limit is None else min(config.num_random, limit), config.random_scale
-            )
-        chosen = evenly_chosen(len(points), len(points) if limit is None else limit)
-        return gaussians_at(points[chosen], colors[chosen], sh_degree=config.sh_degree)
-
-    def _make_strategy(self) -> CappedStrategy | CappedMCMC:
-        config = self.config
-        if config.strategy == "mcmc":
-            return CappedMCMC(
-                cap_max=_MOST_WITHOUT_LIMIT if config.max_gaussians is None else config.max_gaussians,
-                noise_lr=config.mcmc_noise_lr,
-                refine_start_iter=config.warmup_length,
-                refine_stop_iter=config.stop_split_at,
-                refine_every=config.refine_every,
-            )
-        return CappedStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
-            prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=config.stop_screen_size_at,
-            refine_start_iter=config.warmup_length,
-            refine_stop_iter=config.stop_split_at,
-            reset_every=config.reset_alpha_every * config.refine_every,
-            refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
-            absgrad=config.use_absgrad,
-            max_gaussians=config.max_gaussians,
-        )
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load Gaussians of any number into the very parameters that the optimizers hold.
@@ -214,28 +174,15 @@ class FillerbusterSplatModel(SplatfactoModel):
 
         Raises ValueError when points and colors disagree in shape or are not finite.
         """
-        if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
-            raise ValueError(
-                f"points and colors: expected two shapes [m, 3], got {list(points.shape)} and {list(colors.shape)}"
-            )
-        if not bool(points.isfinite().all() and colors.isfinite().all()):
-            raise ValueError("points and colors: expected finite values, got NaN or infinity; drop those points first")
+        require_points(points, colors)
         chosen = evenly_chosen(len(points), len(points) if self.room is None else self.room).to(points.device)
         if len(chosen) == 0:
             return 0
         points, colors = points[chosen].to(self.means), colors[chosen].to(self.means)
-        rows = gaussians_at(
-            points,
-            colors,
-            sh_degree=self.config.sh_degree,
-            opacity=min(2 * self.config.cull_alpha_thresh, 0.5),
-            among=self.means.detach(),
-        )
+        opacity, among = min(2 * self.config.cull_alpha_thresh, 0.5), self.means.detach()
+        rows = gaussians_at(points, colors, sh_degree=self.config.sh_degree, opacity=opacity, among=among)
         append_rows(self.gauss_params, optimizers.optimizers, self.strategy_state, rows)
-        for name in rows:
-            if name in optimizers.parameters:  # what gradient clipping reads
-                optimizers.parameters[name] = [self.gauss_params[name]]
-        self.info = {}
+        self._gaussians_changed(optimizers)
         return len(chosen)
 
     @torch.no_grad()
@@ -249,11 +196,14 @@ class FillerbusterSplatModel(SplatfactoModel):
         if not bool(chosen.any()) or bool(chosen.all()):
             return 0
         remove(params=self.gauss_params, optimizers=optimizers.optimizers, state=self.strategy_state, mask=chosen)
+        self._gaussians_changed(optimizers)
+        return int(chosen.sum())
+
+    def _gaussians_changed(self, optimizers: Optimizers) -> None:
         for name in self.gauss_params:
             if name in optimizers.parameters:  # what gradient clipping reads
                 optimizers.parameters[name] = [self.gauss_params[name]]
         self.info = {}
-        return int(chosen.sum())
 
     # ---------------------------------------------------------------------------------------------------- rendering
 
@@ -264,14 +214,9 @@ class FillerbusterSplatModel(SplatfactoModel):
         Normals are pictures in [0, 1] (see ``normal_picture``). Training renders depth and normals only when a loss or
         ``output_depth_during_training`` needs them. Raises ValueError for anything but one camera.
         """
-        if (
-            not self.training
-            and isinstance(camera, Cameras)
-            and camera.camera_to_worlds.numel() == 12
-            and is_panorama(camera)
-        ):
+        if not self.training and is_panorama(camera):
             return draw_panorama(camera, self.get_outputs)
-        pinhole = self._pinhole(camera)
+        pinhole = self.drawn_camera(camera)
         self.last_size = (pinhole.height, pinhole.width)
         background = self._get_background_color()
         splats = self._cropped_splats()
@@ -305,52 +250,20 @@ class FillerbusterSplatModel(SplatfactoModel):
     @staticmethod
     def get_empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Tensor]:
         """The outputs of a view that contains no Gaussian; all keys of a full one."""
-        rgb = background.expand(height, width, 3)
-        no_normal = torch.full_like(rgb, 0.5)
-        return {
-            "rgb": rgb,
-            "accumulation": rgb.new_zeros(height, width, 1),
-            "background": rgb,
-            "depth": rgb.new_full((height, width, 1), 10.0),
-            "normal": no_normal,
-            "surface_normal": no_normal,
-        }
+        return empty_outputs(width, height, background)
 
-    def _pinhole(self, camera: Cameras) -> Pinholes:
-        """The camera with the optimizer's correction, at the resolution of this stage of training."""
-        if isinstance(camera, RayBundle):
-            raise Refused(
-                "splats are drawn picture by picture and answer no single rays; ns-export has gaussian-splat and "
-                "cameras for them"
-            )
-        if not isinstance(camera, Cameras) or camera.camera_to_worlds.numel() != 12:
-            got = (
-                f"{camera.camera_to_worlds.numel() // 12} cameras"
-                if isinstance(camera, Cameras)
-                else type(camera).__name__
-            )
-            raise ValueError(f"camera: expected one nerfstudio camera, got {got}; render cameras one by one")
-        # ns-render reads the focal lengths of camera paths in double precision.
-        pinhole = to_pinholes(camera).to(self.device, self.means.dtype)
-        if not self.training:  # paths of scaled scenes (nerfstudio's Blender add-on) carry the scale in their rotations
-            turn = F.normalize(pinhole.rotations, dim=1)
-            pinhole = dataclasses.replace(
-                pinhole, camera_to_world=torch.cat([turn, pinhole.camera_to_world[:, :, 3:]], dim=2)
-            )
+    def drawn_camera(self, camera: Cameras) -> Pinholes:
+        """The camera with the optimizer's correction, at the resolution of this stage of training.
+
+        Raises ValueError for anything but one camera.
+        """
+        pinhole = one_pinhole(camera).to(self.device, self.means.dtype)
         if self.training:
             corrected = self.camera_optimizer.apply_to_camera(camera).reshape(-1, 3, 4)
             pinhole = dataclasses.replace(pinhole, camera_to_world=flip_axes(corrected))
-        factor = self._get_downscale_factor()
-        if factor == 1:
-            return pinhole
-        # Not Pinholes.scaled: images are averaged over whole blocks and a remainder is dropped, so the factor is exact.
-        return dataclasses.replace(
-            pinhole,
-            focal=pinhole.focal / factor,
-            principal=pinhole.principal / factor,
-            width=pinhole.width // factor,
-            height=pinhole.height // factor,
-        )
+        else:
+            pinhole = with_unit_axes(pinhole)
+        return shrunk(pinhole, self._get_downscale_factor())
 
     def _get_background_color(self) -> Tensor:
         """As in splatfacto; renders of a camera path with a crop have the crop's own."""
@@ -374,8 +287,11 @@ class FillerbusterSplatModel(SplatfactoModel):
         self, splats: dict[str, Tensor], pinhole: Pinholes, with_normals: bool, with_depth: bool
     ) -> tuple[Float[Tensor, "h w x"], Float[Tensor, "h w 1"], dict[str, Any]]:
         """Channels: 3 colours, then 3 summed normals in the camera frame if wanted, then expected z-depth if wanted."""
-        colors, sh_degree = self._colors(splats, pinhole, evaluate_harmonics=with_normals)
-        if with_normals:
+        config = self.config
+        colors, sh_degree = colors_of(splats, min(self.step // config.sh_degree_interval, config.sh_degree))
+        if with_normals:  # beside normals in one pass, harmonics must be evaluated beforehand
+            if sh_degree is not None:
+                colors, sh_degree = sh_colors(sh_degree, splats["means"] - pinhole.centers, colors), None
             normals = gaussian_normals(splats["means"], splats["quats"], splats["scales"], pinhole)
             colors = torch.cat([colors, normals], dim=-1)
         scales, opacities = splats["scales"].exp(), splats["opacities"].sigmoid().squeeze(-1)
@@ -399,20 +315,6 @@ class FillerbusterSplatModel(SplatfactoModel):
         )
         return drawn.colors[0], drawn.alphas[0], drawn.meta
 
-    def _colors(
-        self, splats: dict[str, Tensor], pinhole: Pinholes, *, evaluate_harmonics: bool
-    ) -> tuple[Tensor, int | None]:
-        """Colours or harmonics, and their degree. Beside normals in one pass, harmonics must be evaluated
-        beforehand.
-        """
-        if self.config.sh_degree == 0:
-            return splats["features_dc"].sigmoid(), None
-        degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
-        coefficients = torch.cat([splats["features_dc"][:, None], splats["features_rest"]], dim=1)
-        if not evaluate_harmonics:
-            return coefficients, degree
-        return sh_colors(degree, splats["means"] - pinhole.centers, coefficients), None
-
     # ------------------------------------------------------------------------------------------- losses and metrics
 
     def get_loss_dict(
@@ -424,39 +326,34 @@ class FillerbusterSplatModel(SplatfactoModel):
         ``batch["view_weight"]`` (default 1) multiplies what this view contributes, ``batch["trust"]`` (default 1) what
         each of its pixels does; neither touches the regularisers of the scene.
         """
-        config, known, weight = self.config, self._known(batch), batch.get("view_weight", 1.0)
-        target, rgb, trust = self._target(outputs, batch), outputs["rgb"], self._trust(batch)
-        main = (1 - config.ssim_lambda) * photometric.l1(rgb, target, known, trust)
-        if config.ssim_lambda > 0:
-            main = main + config.ssim_lambda * photometric.dissimilarity(rgb, target, known, trust)
-        losses = {"main_loss": weight * main, "scale_reg": self._scale_regularization()}
+        config, seen = self.config, self._supervision(outputs, batch)
+        losses = {
+            "main_loss": seen.photometric(outputs["rgb"], ssim_lambda=config.ssim_lambda),
+            "scale_reg": self._scale_regularization(),
+        }
         if self.training and self._normals_wanted():
-            if trust is not None:  # losses of normals are means over what counts: of so much of it, by so much weight
-                mean, known = photometric.known_mean(trust, known), trust if known is None else known * trust
-                weight = weight * mean
-            losses |= {name: weight * value for name, value in self._normal_losses(outputs, known).items()}
+            weights = {"alignment": config.normal_alignment_weight, "tv": config.normal_tv_weight}
+            losses |= seen.normals(outputs["normal"], outputs["surface_normal"], weights, form=config.normal_alignment)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
             if config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
 
-    def _normal_losses(self, outputs: dict[str, Tensor], known: Tensor | None) -> dict[str, Tensor]:
-        config, losses = self.config, {}
-        if config.normal_alignment_weight > 0:
-            rendered, surface = normals_of_picture(outputs["normal"]), normals_of_picture(outputs["surface_normal"])
-            alignment = alignment_loss(rendered, surface, known, form=config.normal_alignment)
-            losses["normal_alignment"] = config.normal_alignment_weight * alignment
-        if config.normal_tv_weight > 0:
-            losses["normal_tv"] = config.normal_tv_weight * total_variation(outputs["normal"], known)
-        return losses
-
     def _scale_regularization(self) -> Float[Tensor, ""]:
         """Penalty on needles (PhysGaussian), every tenth step if it is on at all."""
         if not self.config.use_scale_regularization or self.step % 10:
             return self.means.new_zeros(())
-        log_ratio = self.scales.amax(dim=-1) - self.scales.amin(dim=-1)
-        return 0.1 * (log_ratio.exp() - self.config.max_gauss_ratio).clamp_min(0.0).mean()
+        return needles(self.scales, self.config.max_gauss_ratio)
+
+    def _supervision(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> Supervision:
+        """What the batch says of a render, at the current resolution."""
+        return Supervision(
+            target=self._target(outputs, batch),
+            known=self._known(batch),
+            trust=self._downscale_if_required(batch["trust"].float()).to(self.device) if "trust" in batch else None,
+            weight=batch.get("view_weight", 1.0),
+        )
 
     def _target(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> Float[Tensor, "h w 3"]:
         """The batch's picture at the current resolution."""
@@ -480,20 +377,13 @@ class FillerbusterSplatModel(SplatfactoModel):
             raise ValueError(f"batch['mask']: expected the image's size {size}, got {tuple(mask.shape[:2])}")
         return self._downscale_if_required(mask.reshape(*size, 1).float()).to(self.device)
 
-    def _trust(self, batch: dict[str, Any]) -> Float[Tensor, "h w 1"] | None:
-        """How far the batch's pixels are believed, at the current resolution; None where wholly."""
-        return self._downscale_if_required(batch["trust"].float()).to(self.device) if "trust" in batch else None
-
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> dict[str, Any]:
         """PSNR over known pixels and the number of Gaussians."""
-        target, known = self._target(outputs, batch), self._known(batch)
-        metrics: dict[str, Any] = {
-            "psnr": photometric.psnr(outputs["rgb"], target, known),
-            "gaussian_count": self.num_points,
-        }
+        seen, rgb = self._supervision(outputs, batch), outputs["rgb"]
+        metrics: dict[str, Any] = {"psnr": seen.psnr(rgb), "gaussian_count": self.num_points}
         if self.config.color_corrected_metrics:
-            metrics["cc_psnr"] = photometric.psnr(color_correct(outputs["rgb"], target), target, known)
+            metrics["cc_psnr"] = seen.psnr(color_correct(rgb, seen.target))
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -502,15 +392,9 @@ class FillerbusterSplatModel(SplatfactoModel):
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and, where its weights are at hand, LPIPS over known pixels; and the pair target | render."""
-        target, rgb, known = self._target(outputs, batch), outputs["rgb"], self._known(batch)
-        compared = {"": rgb}
+        seen, rgb = self._supervision(outputs, batch), outputs["rgb"]
+        metrics = seen.metrics(rgb, self.lpips)
         if self.config.color_corrected_metrics:
-            compared["cc_"] = color_correct(rgb, target)
-        metrics: dict[str, float] = {}
-        for prefix, image in compared.items():
-            metrics[f"{prefix}psnr"] = float(photometric.psnr(image, target, known))
-            metrics[f"{prefix}ssim"] = float(photometric.ssim(image, target, known))
-            distance = self.lpips(image, target) if known is None else self.lpips(image * known, target * known)
-            if distance is not None:
-                metrics[f"{prefix}lpips"] = distance
-        return metrics, {"img": torch.cat([target, rgb], dim=1)}
+            corrected = seen.metrics(color_correct(rgb, seen.target), self.lpips)
+            metrics |= {f"cc_{name}": value for name, value in corrected.items()}
+        return metrics, {"img": torch.cat([seen.target, rgb], dim=1)}

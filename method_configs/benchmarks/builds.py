@@ -198,9 +198,9 @@ def _standard_error(values: list[float]) -> float:
 
 def draw(report: Report, path: Path) -> None:
     """PSNR over CPU seconds, one line a case from the other build to this one."""
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = _axes("PSNR of unknown views (dB)")
+    figure, axes = new_axes("PSNR of unknown views (dB)")
     for case in dict.fromkeys(row["case"] for row in report.rows if "case" in row):
         rows = [row for row in report.rows if row.get("case") == case]
         axes.plot(
@@ -210,4 +210,4 @@ def draw(report: Report, path: Path) -> None:
             axes.annotate(row["build"], (row["cpu_seconds"], row["psnr"]), fontsize=7)
     axes.set(xscale="log", xlabel="CPU seconds of a whole sampling")
     axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

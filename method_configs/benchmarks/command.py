@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fb_core.files.ownership import signature
-from fb_core.files.whole import whole_file
+from method_configs.benchmarks.figures import new_axes, save_figure
 
 if TYPE_CHECKING:
     from fb_core.evaluation.results import Report
@@ -142,7 +141,7 @@ def _draw_networks(report: Report, path: Path) -> None:
     """Two bars per cell: the original's way and ours."""
     rows = [row for row in report.rows if row["part"] == "sampling"]
     labels = [f"{row['views']} views\nof {row['size']}" for row in rows]
-    figure, axes = _axes("seconds per sampling")
+    figure, axes = new_axes("seconds per sampling")
     places = range(len(rows))
     axes.bar(
         [place - 0.2 for place in places],
@@ -156,12 +155,12 @@ def _draw_networks(report: Report, path: Path) -> None:
     axes.set_xticks(list(places), labels)
     axes.set_yscale("log")
     axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_precision(report: Report, path: Path) -> None:
     """Mean error of the images over guidance, one line per number of views."""
-    figure, axes = _axes("mean error of generated pixels (range 0 to 1)")
+    figure, axes = new_axes("mean error of generated pixels (range 0 to 1)")
     for count in dict.fromkeys(row["views"] for row in report.rows):
         rows = [row for row in report.rows if row["views"] == count]
         axes.plot(
@@ -173,25 +172,4 @@ def _draw_precision(report: Report, path: Path) -> None:
     axes.set_xlabel("guidance scale of unknown content")
     axes.set_yscale("log")
     axes.legend()
-    _save(figure, path)
-
-
-def _axes(label: str) -> tuple[Any, Any]:
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(8, 4.5), layout="constrained")
-    axes.set_ylabel(label)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
-
-
-def _save(figure: Any, path: Path) -> None:
-    from matplotlib import pyplot
-
-    with whole_file(path) as unfinished:
-        figure.savefig(unfinished, dpi=150, metadata=signature(path))
-    pyplot.close(figure)
-    _logger.info("wrote %s", path)
+    save_figure(figure, path)

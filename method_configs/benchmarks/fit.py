@@ -251,7 +251,7 @@ def _stir_all(model: FillerbusterSplatModel) -> None:
     """The published noise: on every Gaussian, whether the view saw it or not."""
     import torch
 
-    from fb_nerfstudio.splats.mcmc import position_noise
+    from fb_nerfstudio.splats.strategies.mcmc import position_noise
 
     with torch.no_grad():
         rate = model.optimizers["means"].param_groups[0]["lr"]
@@ -274,7 +274,7 @@ def _draw(report: Report, path: Path) -> None:
     """PSNR of captured and of rarely seen views, and the number of Gaussians, over steps."""
     from matplotlib import pyplot
 
-    from method_configs.benchmarks.command import _save
+    from method_configs.benchmarks.figures import save_figure
 
     figure, panels = pyplot.subplots(1, 3, figsize=(12, 3.6), layout="constrained", sharex=True)
     labels = ("PSNR of the capture, dB", "PSNR of rarely seen views, dB", "Gaussians")
@@ -286,4 +286,4 @@ def _draw(report: Report, path: Path) -> None:
         axes.set_xlabel("step")
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend()
-    _save(figure, path)
+    save_figure(figure, path)

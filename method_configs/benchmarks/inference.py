@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Inference(TableFiles):
             raise ValueError(
                 f"inference: expected sizes that are multiples of 16 pixels, got {' '.join(map(str, self.sizes))}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
         reckoned = model.device.type == "cpu" if self.reckoned is None else self.reckoned
         cells = [(size, views) for size in self.sizes for views in self.views]
         report = Report(seed=self.seed)
@@ -139,9 +139,9 @@ def timed(model: Fillerbuster, views: int, size: int, steps: int, seed: int) -> 
 
 def draw(report: Report, path: Path) -> None:
     """Seconds over the number of views, a curve for each size and number of steps, and the paper's beside them."""
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = _axes("seconds")
+    figure, axes = new_axes("seconds")
     for size, steps in dict.fromkeys((row["size"], row["steps"]) for row in report.rows):
         rows = [row for row in report.rows if (row["size"], row["steps"]) == (size, steps)]
         label = f"{size} pixels, {steps} steps, {rows[0]['how']}"
@@ -152,4 +152,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("views")
     axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

@@ -22,6 +22,7 @@ from rich.table import Table
 from fb_core.files.limits import MOST_SEED, MOST_TRAINING_STEPS, require_between
 from fb_core.files.ownership import MARK_NAME, Target, mark_text
 from fb_core.files.whole import remove_folder, swept, whole_file
+from fb_core.machine.clock import Clock
 from fb_core.machine.resources import usable_cores
 from fb_nerfstudio.runs.earlier_runs import clear_run
 from fb_nerfstudio.runs.training_process import TrainingProcess
@@ -54,7 +55,7 @@ def run_demo(output: Path, *, seed: int = 0, iterations: int = 1500, model: Path
     read_config(model or BUNDLED_MODEL)  # a missing model is told before anything is made
     output = output.absolute()
     _clear(output, inputs=() if model is None else (model,))
-    clock = _Clock()
+    clock = Clock()
     with _peak_memory() as memory, _Bars() as bars:
         with clock.stage("capture"), bars.stage("Room capture") as bar:
             rooms(seed, output / "capture", family=FAMILY, views=VIEWS, size=SIZE, held_out=HELD_OUT)
@@ -144,25 +145,6 @@ def _is_room(capture: Path) -> bool:
         return "room" in load_transforms(capture / JSON_NAME)
     except (OSError, ValueError):
         return False
-
-
-class _Clock:
-    """Seconds of each stage and of all."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._began = time.monotonic()
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        began = time.monotonic()
-        yield
-        self.seconds[name] = time.monotonic() - began
-
-    def rounded(self) -> dict[str, float]:
-        return {
-            name: round(value, 1) for name, value in (self.seconds | {"total": time.monotonic() - self._began}).items()
-        }
 
 
 class _Bars:

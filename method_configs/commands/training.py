@@ -24,12 +24,13 @@ from fb_core.checkpoint import CONFIG_FILE, model_target, require_model_or_free
 from fb_core.data.meshes.mesh_views import find_meshes
 from fb_core.data.training.capture_sequences import find_captures
 from fb_core.data.training.shard_stream import find_shards
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from fb_core.training.dry_run import Cost, measure
 from fb_core.training.recipe import STAGES, Recipe, adopt_autoencoders, export, require_text_encoder, run_stage
 from fb_core.training.run.checkpoints import read_state
-from fb_core.training.run.distributed import Group, joined
-from fb_core.training.run.loop import EngineConfig, OnProgress
+from fb_core.training.run.distributed import Group, in_group
+from fb_core.training.run.loop import OnProgress
+from fb_core.training.run.options import EngineConfig
 from fb_core.training.run.progress_log import ProgressLog
 from fb_core.training.stages.perceptual import load_lpips
 from method_configs.commands.train_options import TrainOptions
@@ -81,7 +82,7 @@ def train_preset(preset: str, output: Path, options: TrainOptions = TrainOptions
     _require_data(recipe, stages, dry_run=options.dry_run)
     if not options.dry_run:
         _require_own_model_or_free(output, options.start_from)  # before days of training, not after them
-    with joined(usable_device(options.device)) as (group, where):
+    with in_group(chosen_device(options.device)) as (group, where):
         training = _Training(recipe=recipe, output=output, options=options, engine=engine, device=where, group=group)
         if options.dry_run:
             for name in training.stages:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Conditioning(TableFiles):
                 f"got known {' '.join(map(str, self.known)) or 'none'}, hidden {self.hidden}, sequences "
                 f"{self.sequences}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
         sampling = model.recommended_sampling
         sampling = sampling if self.steps is None else dataclasses.replace(sampling, steps=self.steps)
         sequences = self._sequences(self.size or model.size)
@@ -125,12 +125,12 @@ class Conditioning(TableFiles):
 
 def draw(report: Report, path: Path) -> None:
     """PSNR over the number of known views, with 95 % intervals."""
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = _axes("PSNR of the hidden views (dB)")
+    figure, axes = new_axes("PSNR of the hidden views (dB)")
     known, heights, spread = ([row[name] for row in report.rows] for name in ("known", "psnr", "psnr_interval"))
     axes.errorbar(known, heights, spread, fmt="o-", capsize=3)
     axes.set_xscale("log", base=2)
     axes.set_xticks(known, [str(count) for count in known])
     axes.set_xlabel("known views")
-    _save(figure, path)
+    save_figure(figure, path)

@@ -243,9 +243,9 @@ def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: s
     """The share of pairs below each threshold, one curve for each method over all its captures."""
     import numpy as np
 
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = _axes("share of pairs with a smaller error")
+    figure, axes = new_axes("share of pairs with a smaller error")
     limits = np.geomspace(0.1, _CURVE_DEGREES, 200)
     for method in dict.fromkeys(method for method, _ in judged):
         errors = np.array([one.error_degrees for key, found in judged.items() if key[0] == method for one in found])
@@ -254,4 +254,4 @@ def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: s
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
     axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

@@ -234,11 +234,11 @@ def publish(files: TableFiles, rows: list[dict[str, Any]], seed: int) -> None:
 
 def draw(report: Report, path: Path) -> None:
     """PSNR of each run with its 95 % interval."""
-    from method_configs.benchmarks.command import _axes, _save
+    from method_configs.benchmarks.figures import new_axes, save_figure
 
     rows = [row for row in report.rows if row["part"] != _PAPER_PART]
-    figure, axes = _axes("PSNR of renders against inpainted pictures (dB)")
+    figure, axes = new_axes("PSNR of renders against inpainted pictures (dB)")
     labels = [f"{row['method']}\n{row['capture']}\n{row['normals']} normals" for row in rows]
     axes.bar(range(len(rows)), [row["psnr"] for row in rows], yerr=[row["psnr_interval"] for row in rows], capsize=4)
     axes.set_xticks(range(len(rows)), labels)
-    _save(figure, path)
+    save_figure(figure, path)

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class ModelOnCaptures(TableFiles):
             )
         distance, models = _distance(self.lpips), {}
         for folder in self.models or (None,):
-            model = Fillerbuster.from_pretrained(folder, device=usable_device(self.device))
+            model = Fillerbuster.from_pretrained(folder, device=chosen_device(self.device))
             models["bundled" if folder is None else folder.name] = model
         if len(models) < len(self.models):
             raise ValueError(
@@ -187,7 +187,7 @@ def draw(report: Report, path: Path) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    from method_configs.benchmarks.command import _save
+    from method_configs.benchmarks.figures import save_figure
 
     rows = [row for row in report.rows if row["part"] != _PAPER_PART]
     figure, panels = pyplot.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
@@ -203,4 +203,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend()
-    _save(figure, path)
+    save_figure(figure, path)

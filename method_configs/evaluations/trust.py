@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Trust(TableFiles):
                 "trust: expected at least 4 known views, fewer than views, and at least one room and sample, "
                 f"got known {self.known}, views {self.views}, rooms {self.rooms}, samples {self.samples}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=usable_device(self.device))
+        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
         found = [self._room(model, number) for number in track(range(self.rooms), description="rooms", transient=True)]
         rows = []
         for part in PARTS:
@@ -205,7 +205,7 @@ def draw(report: Report, path: Path) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    from method_configs.benchmarks.command import _save
+    from method_configs.benchmarks.figures import save_figure
 
     parts = list(dict.fromkeys(row["part"] for row in report.rows))
     figure, panels = pyplot.subplots(
@@ -220,4 +220,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel("squared error")
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend()
-    _save(figure, path)
+    save_figure(figure, path)

@@ -19,8 +19,10 @@ from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAEConfig
 from fb_core.sampling import SamplingConfig
 from fb_core.training.recipe import Recipe
-from fb_core.training.run.distributed import Group, joined, left_at_once, whole
-from fb_core.training.run.loop import EngineConfig, LoopConfig, Run, Stage, row_generator
+from fb_core.training.run.distributed import Group, in_group, left_at_once, whole
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import EngineConfig, LoopConfig
+from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.dit_stage import DiTLossConfig
 from fb_core.training.stages.vae_stage import VAELossConfig
 
@@ -91,7 +93,7 @@ def _child(folder: Path) -> None:
     torch.set_num_threads(1)
     # No curves: importing it takes longer than the training.
     sys.modules["matplotlib"] = None  # type: ignore[assignment]
-    with joined(torch.device("cpu")) as (group, _):
+    with in_group(torch.device("cpu")) as (group, _):
         for name, engine in {
             "two": {},
             "parts": {"accumulate": 2},

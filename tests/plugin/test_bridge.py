@@ -7,7 +7,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.bridge import batch_image, batch_known, flip_axes, to_nerfstudio, to_pinhole_list, to_pinholes
+from fb_core.geometry.rotations import flip_axes
+from fb_nerfstudio.bridge import batch_image, batch_known, to_nerfstudio, to_pinhole_list, to_pinholes
 
 
 def some_pinholes(count: int = 3, width: int = 20, height: int = 14) -> Pinholes:

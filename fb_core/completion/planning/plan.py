@@ -213,7 +213,7 @@ def _with_own_context(planned: PlannedRound, context: Sequence[int], site: _Site
 
 def _placed_rounds(site: _Site, context: Sequence[int], config: CompletionConfig, size: int) -> list[PlannedRound]:
     """Anchors, then rounds of densified views, placed where the capture needs them."""
-    half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
+    half_angle = math.atan(size / 2 / focal_of_new_views(site.cameras, context, size))
     need = site.need()
     generator = torch.Generator().manual_seed(round_seed(config.seed, -1))
     rounds = []
@@ -240,7 +240,7 @@ def _needed_rounds(
     After former rounds it is one round of what these have left, and none where that would add too little.
     Also returns the shares of what surrounds the capture that are seen before and after, and what is seen before.
     """
-    half_angle = math.atan(size / 2 / lens_of(site.cameras, context, size))
+    half_angle = math.atan(size / 2 / focal_of_new_views(site.cameras, context, size))
     places = site.candidates(torch.Generator().manual_seed(round_seed(config.seed, -1)), former)
     if config.film_path is not None:
         places = with_path(places, read_camera_path(config.film_path, size=size).cameras, site.shape)
@@ -304,7 +304,7 @@ def _path_rounds(config: CompletionConfig, size: int) -> list[PlannedRound]:
     ]
 
 
-def lens_of(cameras: Sequence[Pinholes], context: Sequence[int], size: int) -> float:
+def focal_of_new_views(cameras: Sequence[Pinholes], context: Sequence[int], size: int) -> float:
     """Focal length in pixels of new square views: the scale of the fitted context views, one lens for all as in
     training.
     """

@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from fb_core.data.capture.transforms_json import to_opengl
 from fb_core.files.json_files import read_json
 from fb_core.files.limits import MOST_VIEWS
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import flip_axes
 
 _LEAST_DEGREES, _MOST_DEGREES = 1.0, 170.0
 _MOST_BYTES = 2**26  # of a file: 6 KiB for each of the most cameras
@@ -67,7 +67,7 @@ def read_camera_path(path: Path, *, size: int) -> CameraPath:
     )
     focal = 0.5 * height / torch.tan(torch.deg2rad(degrees) / 2) * size / max(width, height)
     cameras = Pinholes(
-        camera_to_world=to_opengl(poses).float(),
+        camera_to_world=flip_axes(poses).float(),
         focal=focal[:, None].expand(-1, 2).float().contiguous(),
         principal=torch.full((len(entries), 2), size / 2),
         width=size,

@@ -18,13 +18,13 @@ import torch
 
 from fb_core.data import media
 from fb_core.data.capture.colmap.lenses import lens_of
-from fb_core.data.capture.colmap.model import rotations_of
 from fb_core.data.capture.colmap.reader import ColmapPose, has_model, model_size, points_file, read_model
 from fb_core.data.capture.frames import Capture, Frame, read_transforms
 from fb_core.data.capture.transforms_json import JSON_NAME, with_suffix
 from fb_core.files.json_files import read_json
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import rotations_of
 
 Kind = Literal["transforms", "blender", "scannetpp", "colmap"]
 BLENDER_NAMES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
@@ -283,7 +283,7 @@ def _read_colmap(model: Path) -> Capture:
 def _camera_to_world(pose: ColmapPose) -> torch.Tensor:
     """[1, 3, 4]; COLMAP's axes are ours."""
     quaternion = torch.tensor([pose.quaternion], dtype=torch.float64)
-    turn = rotations_of(quaternion / quaternion.norm())[0].T
+    turn = rotations_of((quaternion / quaternion.norm()).double())[0].T
     center = -turn @ torch.tensor(pose.translation, dtype=torch.float64)
     return torch.cat([turn, center[:, None]], dim=1)[None]
 

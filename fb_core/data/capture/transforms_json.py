@@ -19,6 +19,7 @@ from fb_core.data.capture.undistort import FISHEYE_MODELS, PERSPECTIVE_MODELS
 from fb_core.files.json_files import read_json
 from fb_core.files.limits import is_finite
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import flip_axes
 
 JSON_NAME = "transforms.json"
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -46,13 +47,6 @@ def load_transforms(path: Path) -> dict[str, Any]:
             "again"
         )
     return meta
-
-
-def to_opengl(pose: Float[Tensor, "*n 3 4"]) -> Float[Tensor, "*n 3 4"]:
-    """OpenCV camera-to-world matrices to OpenGL axes, or back (it is its own inverse): the second and third axes turn
-    around.
-    """
-    return pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def camera_from(where: str, image_path: Path, entry: dict[str, Any], shared: dict[str, Any]) -> Pinholes:
@@ -90,7 +84,7 @@ def camera_from(where: str, image_path: Path, entry: dict[str, Any], shared: dic
     center_x = finite_number(where, values, "cx") if "cx" in values else width / 2
     center_y = finite_number(where, values, "cy") if "cy" in values else height / 2
     return Pinholes(
-        camera_to_world=to_opengl(checked_pose(where, entry.get("transform_matrix")))[None],
+        camera_to_world=flip_axes(checked_pose(where, entry.get("transform_matrix")))[None],
         focal=torch.tensor([focal], dtype=torch.float64),
         principal=torch.tensor([[center_x, center_y]], dtype=torch.float64),
         width=int(width),
@@ -103,7 +97,7 @@ def camera_entry(camera: Pinholes) -> dict[str, Any]:
     cameras.
     """
     (focal_x, focal_y), (center_x, center_y) = camera.focal[0].tolist(), camera.principal[0].tolist()
-    pose = [*to_opengl(camera.camera_to_world[0].double()).tolist(), [0.0, 0.0, 0.0, 1.0]]
+    pose = [*flip_axes(camera.camera_to_world[0].double()).tolist(), [0.0, 0.0, 0.0, 1.0]]
     intrinsics = {
         "fl_x": focal_x,
         "fl_y": focal_y,

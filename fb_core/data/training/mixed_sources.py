@@ -49,7 +49,7 @@ class AnyOf:
 
     def sequences(self, rows: range, task: TaskConfig, draw: Draw) -> Sequences:
         """Each row from one of them."""
-        return joined(
+        return one_batch(
             [
                 source.sequences(one, task, lambda _, g=generator: g)
                 for source, one, generator in self._choices(rows, draw)
@@ -134,7 +134,7 @@ class SeveralPerRow:
             generator = draw(row)
             alone = range(row, rows.stop, rows.stop)
             parts += [self.source.sequences(alone, task, lambda _, g=generator: g) for _ in range(self.count)]
-        return joined(parts)
+        return one_batch(parts)
 
 
 class Later:
@@ -219,7 +219,7 @@ class InTurn:
 _ALL_OR_NONE = ("image_latents", "distance")
 
 
-def joined(parts: list[Sequences]) -> Sequences:
+def one_batch(parts: list[Sequences]) -> Sequences:
     """One batch of batches of the same sizes.
 
     Latents and distances are kept if all have them; truth is everywhere where nothing is said.

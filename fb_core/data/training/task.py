@@ -18,6 +18,7 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import CanonicalFrame
+from fb_core.geometry.rotations import rotations_of
 from fb_core.masks import drop_conditioning, partly_known, training_mixture
 
 Draw = Callable[[int], torch.Generator]
@@ -148,15 +149,7 @@ def task_order(cameras: Pinholes, task: TaskConfig, *, generator: torch.Generato
 
 def _random_frame(cameras: Pinholes, fill: float, generator: torch.Generator) -> CanonicalFrame:
     """Any rotation, and any centre in the cube around the cameras."""
-    w, x, y, z = F.normalize(torch.randn(4, generator=generator).double(), dim=0).tolist()
-    rotation = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    rotation = rotations_of(F.normalize(torch.randn(4, generator=generator).double(), dim=0)[None])[0]
     centers = cameras.centers.detach().cpu().double()
     low, high = centers.amin(dim=0), centers.amax(dim=0)
     center = (low + high) / 2 + (high - low).max() / 2 * (2 * torch.rand(3, generator=generator).double() - 1)

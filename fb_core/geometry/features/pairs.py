@@ -181,7 +181,7 @@ def verified_pair(
     rotation, translation, inliers = _motion(first, second, tolerance)
     if inliers.sum() < FEWEST_MATCHES:
         return None
-    angle = angles_degrees(rays_of(first[inliers]) @ rotation.T, rays_of(second[inliers]))
+    angle = angles_degrees(rays_through(first[inliers]) @ rotation.T, rays_through(second[inliers]))
     return Pair(
         first=i,
         second=j,
@@ -249,7 +249,7 @@ def _misses(
     )
 
 
-def rays_of(places: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:
+def rays_through(places: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:
     """Unit vectors through places in the plane at distance 1."""
     rays = np.concatenate([places, np.ones((len(places), 1))], axis=1)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)

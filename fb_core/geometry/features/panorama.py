@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from fb_core.geometry.features.pairs import PhotoFeatures, angles_degrees, rays_of
+from fb_core.geometry.features.pairs import PhotoFeatures, angles_degrees, rays_through
 
 _GUESSES = np.geomspace(0.4, 3.0, 16)  # longer sides: 103 to 19 degrees of view
 _PAIRS = 6  # with most matches, by which guesses are judged
@@ -108,7 +108,7 @@ def _turn(
     normalised = np.diag([1 / focal[j], 1 / focal[j], 1]) @ homography.map @ np.diag([focal[i], focal[i], 1])
     left, _, right = np.linalg.svd(normalised * np.sign(np.linalg.det(normalised)))
     turn = left @ right
-    angles = angles_degrees(rays_of(first / focal[i]) @ turn.T, rays_of(second / focal[j]))
+    angles = angles_degrees(rays_through(first / focal[i]) @ turn.T, rays_through(second / focal[j]))
     return turn, np.radians(angles) / max(photos[i].tolerance / focal[i], photos[j].tolerance / focal[j])
 
 

@@ -19,7 +19,7 @@ from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straight
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of
 from fb_core.geometry.features.lenses import LensGuess
 from fb_core.geometry.features.own_lens import LensTrial, Placed, lens_doubt, lens_trial, shared_doubt, sight_of
-from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_of
+from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_through
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
 from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses, outlying, sigma_of
 from fb_core.geometry.pose_solver.verdict import Arrangement
@@ -154,7 +154,7 @@ class Reconstruction:
             return
         tracks, compact = np.unique(self.track[mine], return_inverse=True)
         rotations = self.rotations[self.owner[mine]]
-        directions = np.einsum("oji,oj->oi", rotations, rays_of(plane))
+        directions = np.einsum("oji,oj->oi", rotations, rays_through(plane))
         centers = -np.einsum("oji,oj->oi", rotations, self.shifts[self.owner[mine]])
         error = float(np.degrees(np.median(2 * self.tolerance[mine] / self._focal_of(mine))))
         points, sound = nearest_points(

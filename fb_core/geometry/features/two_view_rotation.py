@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fb_core.geometry.features.pairs import angles_degrees, rays_of
+from fb_core.geometry.features.pairs import angles_degrees, rays_through
 
 FEWEST = 10
 """Fewer matches that agree say nothing."""
@@ -49,7 +49,7 @@ def two_view_rotation(
     """
     if len(first) < FEWEST:
         return None
-    rays = rays_of(first), rays_of(second)
+    rays = rays_through(first), rays_through(second)
     turn, misses = _rotation_alone(*rays, tolerance)
     turned = int((misses <= tolerance).sum())
     rotation, kept, lines = _movement(first, second, rays, turn, tolerance)

@@ -67,7 +67,7 @@ ALONE = Group()
 
 
 @contextlib.contextmanager
-def joined(device: torch.device) -> Iterator[tuple[Group, torch.device]]:
+def in_group(device: torch.device) -> Iterator[tuple[Group, torch.device]]:
     """The group that torchrun has started this process in, and this process's device; one process alone joins nothing.
 
     ``device`` is what all were asked for: of several GPUs each process takes its own (cuda becomes cuda:LOCAL_RANK).
@@ -177,7 +177,7 @@ def whole(tree: Any, *, keep: bool = True) -> Any:
     return _mapped(tree, gathered)
 
 
-def spread(value: Tensor, like: Tensor) -> Tensor:
+def sharded_like(value: Tensor, like: Tensor) -> Tensor:
     """A whole tensor spread as ``like`` is (which may mean: as it is)."""
     if not hasattr(like, "full_tensor"):
         return value

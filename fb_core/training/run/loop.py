@@ -11,10 +11,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,148 +20,24 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
-from fb_core.machine.precision import PRECISIONS, Precision, in_words, resolved
+from fb_core.machine.precision import in_words, resolved
 from fb_core.networks.transformer.blocks import Block
 from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.vae import Resnet
-from fb_core.sampling.randomness import generator_of
+from fb_core.training.run.averaged import Averaged
 from fb_core.training.run.checkpoints import Checkpoints
-from fb_core.training.run.distributed import ALONE, Group, averaged_if, averaging, own_part, shard, spread, whole
-from fb_core.training.run.optimizers import OPTIMIZERS, OptimizerName, clip_gradients, load_optimizer, make_optimizers
+from fb_core.training.run.distributed import ALONE, Group, averaged_if, averaging, shard, sharded_like, whole
+from fb_core.training.run.optimizers import clip_gradients, load_optimizer, make_optimizers
+from fb_core.training.run.options import EngineConfig, LoopConfig
 from fb_core.training.run.progress_log import ProgressLog
 from fb_core.training.run.signals import StopSignal
+from fb_core.training.run.stage import Stage
 
 _logger = logging.getLogger(__name__)
 OnProgress = Callable[[int, int, dict[str, float]], None]
 """(steps done, steps in all, latest smoothed losses)."""
 OnSheet = Callable[[Path, dict[str, Tensor]], dict[str, float]]
 """Draws a sample sheet (a file to write) of the averaged weights, and says how good they are on unseen data."""
-
-
-class Stage(ABC):
-    """One thing that is trained: a network, the data of a step, and their loss.
-
-    Rows of a step's batch are numbered from 0; a process asks for some of them, ``range(part, batch, parts)``. What a
-    row holds depends on (seed, step, row) alone. Losses are means over rows, so that the mean over equal parts is the
-    loss of the batch.
-    """
-
-    name: str
-    """Names the stage's folder."""
-    network: nn.Module
-    """What is trained, averaged and exported."""
-    critic: nn.Module | None = None
-    """A further network that is optimised beside it, such as a discriminator. Its loss is part of ``loss``; it is up to
-    the stage that neither network gets gradients of the other's loss.
-    """
-
-    @property
-    @abstractmethod
-    def batch(self) -> int:
-        """Rows of a step's batch, over all processes."""
-
-    @abstractmethod
-    def draw(self, step: int, rows: range) -> Any:
-        """The data of these rows; no gradients, full precision. Steps are asked for in order, perhaps ahead from
-        another thread.
-        """
-
-    @abstractmethod
-    def losses(self, drawn: Any) -> dict[str, Tensor]:
-        """Mean losses over what was drawn; the entry ``loss`` is what is minimised."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopConfig:
-    """How a stage is optimised."""
-
-    steps: int = 1000
-    """Optimiser steps in all."""
-    learning_rate: float = 6e-4
-    """Peak learning rate."""
-    warmup_steps: int = 50
-    """Steps over which the rate rises linearly from 0."""
-    cooldown: float = 0.2
-    """Share of the steps, at the end, over which the rate falls linearly to 0."""
-    weight_decay: float = 1e-2
-    """Decoupled weight decay of matrices (never of norms and biases)."""
-    betas: tuple[float, float] = (0.9, 0.98)
-    """Decay rates of AdamW's moments."""
-    clip: float = 1.0
-    """Largest norm of the gradient."""
-    average: float = 0.998
-    """Decay per step of the exponential average of the weights that is exported; 0 exports the last weights."""
-    save_every: int = 200
-    """Steps between checkpoints."""
-    optimizer: OptimizerName = "adamw"
-    """adamw, or muon for the matrices of the transformer's blocks."""
-
-    def __post_init__(self) -> None:
-        if self.steps < 1 or self.save_every < 1:
-            raise ValueError(
-                f"training: steps and save_every must be at least 1, got {self.steps} and {self.save_every}"
-            )
-        require_between("training: steps", self.steps, 1, MOST_TRAINING_STEPS)
-        if not 0 <= self.cooldown <= 1 or not 0 <= self.average < 1:
-            raise ValueError(
-                f"training: cooldown must lie in [0, 1] and average in [0, 1), got {self.cooldown} and {self.average}"
-            )
-        if self.optimizer not in OPTIMIZERS:
-            raise ValueError(f"training: expected an optimizer out of {list(OPTIMIZERS)}, got {self.optimizer!r}")
-
-    def rate(self, step: int) -> float:
-        """Learning rate of step ``step`` (0-based)."""
-        warm = min(1.0, (step + 1) / max(1, self.warmup_steps))
-        left = (self.steps - step) / max(1.0, self.cooldown * self.steps)
-        return self.learning_rate * min(warm, 1.0, max(0.0, left))
-
-
-@dataclass(frozen=True, kw_only=True)
-class EngineConfig:
-    """How the machine does it; but for rounding, none of this changes what is learned."""
-
-    precision: Precision = "float32"
-    """Of matrix products and convolutions (autocast), of the frozen autoencoders' too, and of Muon's iteration;
-    weights, their average, norms and losses stay in float32. 'auto' is bfloat16 where the device is faster at it.
-    """
-    accumulate: int = 1
-    """Parts that a process does its rows of a batch in, one after the other."""
-    recompute: bool = False
-    """Keep no activations inside blocks; compute them again in the backward pass."""
-    shard: bool = False
-    """Spread the transformer over the processes (FSDP) instead of holding it whole on each."""
-    draw_ahead: bool = False
-    """Prepare the next step's data in another thread; pays where data are made on the CPU for a GPU."""
-    keep: int = 2
-    """Checkpoints kept, the newest included."""
-    sheet_every: int = 0
-    """Steps between sample sheets; 0 for none."""
-    tensorboard: bool = False
-    """Write TensorBoard's files beside log.jsonl."""
-
-    def __post_init__(self) -> None:
-        if self.accumulate < 1 or self.keep < 1 or self.sheet_every < 0:
-            raise ValueError(f"training: accumulate and keep must be at least 1 and sheet_every at least 0, got {self}")
-        if self.precision not in PRECISIONS:
-            raise ValueError(f"training: expected a precision out of {', '.join(PRECISIONS)}, got {self.precision!r}")
-
-
-class Averaged:
-    """Exponential average of a network's floating-point state, with the usual correction for the first steps."""
-
-    def __init__(self, network: nn.Module, decay: float):
-        self.decay, self.updates = decay, 0
-        self.values = {name: value.detach().clone() for name, value in network.state_dict().items()}
-
-    @torch.no_grad()
-    def update(self, network: nn.Module) -> None:
-        """Take the network's present state in."""
-        self.updates += 1
-        decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
-        state = network.state_dict()
-        mine, new = ([own_part(values[name]) for name in self.values] for values in (self.values, state))
-        torch._foreach_lerp_(mine, new, 1 - decay)
 
 
 class _Step(nn.Module):
@@ -224,18 +98,7 @@ class Run:
         """Precision of matrix products."""
         if engine.precision == "auto" and group.is_main:
             _logger.info("%s: matrix products in %s", stage.name, in_words("auto", device))
-        self.optimizers = make_optimizers(
-            stage.network, name=config.optimizer, learning_rate=config.learning_rate, weight_decay=config.weight_decay,
-            betas=config.betas, iteration=self.dtype,
-        )  # fmt: skip
-        if stage.critic is not None:
-            self.optimizers += make_optimizers(
-                stage.critic,
-                name="adamw",
-                learning_rate=config.learning_rate,
-                weight_decay=config.weight_decay,
-                betas=config.betas,
-            )
+        self.optimizers = self._optimizers()
         self._module = averaging(_Step(stage), group, sharded=sharded)
         self.average = Averaged(stage.network, config.average)
         self.step = 0
@@ -246,15 +109,30 @@ class Run:
         self.signal = 0
         """The signal that ended the training early, if any."""
         self._ahead: tuple[int, Future] | None = None
-        self._checkpoints = self._log = None
+        self._checkpoints: Checkpoints | None = None
+        self._log: ProgressLog | None = None
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._checkpoints = Checkpoints(folder, engine.keep)
-            if (path := self._checkpoints.find()) is not None:
-                self._resume(path)
-            group.wait()
-            if group.is_main:
-                self._log = ProgressLog(folder, stage.name, from_step=self.step, tensorboard=engine.tensorboard)
+            self._open(folder)
+
+    def _optimizers(self) -> list[torch.optim.Optimizer]:
+        """Of the network, then of the critic, if there is one."""
+        stage, config = self.stage, self.config
+        each = {"learning_rate": config.learning_rate, "weight_decay": config.weight_decay, "betas": config.betas}
+        optimizers = make_optimizers(stage.network, name=config.optimizer, iteration=self.dtype, **each)
+        if stage.critic is not None:
+            optimizers += make_optimizers(stage.critic, name="adamw", **each)
+        return optimizers
+
+    def _open(self, folder: Path) -> None:
+        """Go on with what is in the folder, and write there from now on."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._checkpoints = Checkpoints(folder, self.engine.keep)
+        if (path := self._checkpoints.find()) is not None:
+            self._resume(path)
+        self.group.wait()
+        if self.group.is_main:
+            tensorboard = self.engine.tensorboard
+            self._log = ProgressLog(folder, self.stage.name, from_step=self.step, tensorboard=tensorboard)
 
     def train(
         self, *, on_progress: OnProgress | None = None, minutes: float = math.inf, at_most: int | None = None
@@ -436,7 +314,7 @@ class Run:
         for optimizer, values in zip(self.optimizers, saved, strict=True):
             load_optimizer(optimizer, values)
         like = network.state_dict()
-        self.average.values = {name: spread(value, like[name]) for name, value in state["average"].items()}
+        self.average.values = {name: sharded_like(value, like[name]) for name, value in state["average"].items()}
         self.average.updates = state["average_updates"]
         self.step, self.seconds, self.waited = state["step"], state["seconds"], state.get("waited", 0.0)
         self.smoothed = state["smoothed"]
@@ -447,7 +325,7 @@ def _load(network: nn.Module, state: dict[str, Tensor]) -> None:
     """Load whole weights into a network that may be spread over processes."""
     like = network.state_dict()
     network.load_state_dict(
-        {name: spread(value, like[name]) if name in like else value for name, value in state.items()}
+        {name: sharded_like(value, like[name]) if name in like else value for name, value in state.items()}
     )
 
 
@@ -461,8 +339,3 @@ def _recompute_blocks(network: nn.Module) -> None:
                 return checkpoint(_forward, *inputs, use_reentrant=False)
 
             block.forward = forgetting  # type: ignore[method-assign]
-
-
-def row_generator(seed: int, step: int, row: int, stream: int = 0) -> torch.Generator:
-    """A CPU generator for one purpose (``stream``) of one row of a step's batch."""
-    return generator_of(seed, step, row, stream)

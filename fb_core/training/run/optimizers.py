@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from fb_core.training.run.distributed import spread
+from fb_core.training.run.distributed import sharded_like
 from fb_core.training.run.muon import Muon
 
 OptimizerName = Literal["adamw", "muon"]
@@ -59,7 +59,7 @@ def load_optimizer(optimizer: Optimizer, state: dict) -> None:
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     spread_state = {
         number: {
-            key: spread(value, parameters[number]) if _follows(value, parameters[number]) else value
+            key: sharded_like(value, parameters[number]) if _follows(value, parameters[number]) else value
             for key, value in entry.items()
         }
         for number, entry in state["state"].items()

@@ -31,7 +31,7 @@ from fb_core.masks import to_latent_grid
 from fb_core.networks.transformer.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.networks.transformer.embeddings import index_positions
 from fb_core.networks.vae import VAE
-from fb_core.training.run.loop import Stage, row_generator
+from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.guesses import Guess, guesses_of
 
 _GUESSES = 3  # stream of random numbers

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from fb_core.data.training.task import Source, TaskConfig
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.networks.vae import VAE
-from fb_core.training.run.loop import Stage, row_generator
+from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.adversarial import PatchDiscriminator, discriminator_loss, generator_loss
 
 

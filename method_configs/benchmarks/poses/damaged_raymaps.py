@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,7 +22,8 @@ from fb_core.evaluation.results import Bar, OnCell, Report
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.pose_solver.solver import PoseSolving, RecoveredCameras, recover_cameras
 from fb_core.geometry.raymap import raymaps_of
-from method_configs.benchmarks.poses.plain_pose_fit import fit_cameras_plainly, rotations_of
+from fb_core.geometry.rotations import rotations_of
+from method_configs.benchmarks.poses.plain_pose_fit import fit_cameras_plainly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +91,7 @@ def noisy(
     origins = origins + 0.01 * degrees * noise(origins)
     directions = torch.nn.functional.normalize(directions + math.radians(degrees) * noise(directions), dim=1)
     height, width = (round(side * math.sqrt(outliers)) for side in raymaps.shape[-2:])
-    turns = rotations_of(torch.randn(len(raymaps), 4, generator=generator, dtype=raymaps.dtype))
+    turns = rotations_of(F.normalize(torch.randn(len(raymaps), 4, generator=generator, dtype=raymaps.dtype), dim=-1))
     directions[..., :height, :width] = torch.einsum("nij,njhw->nihw", turns, directions[..., :height, :width])
     origins[..., :height, :width] += 0.5
     return torch.cat([origins, directions], dim=1)
@@ -137,7 +139,7 @@ def _scene(config: PosesBenchmark, draw: int, *, views: int | None = None) -> tu
     """Cameras anywhere in the cube, turned anyhow, with 40 to 70 degrees of view."""
     generator = torch.Generator().manual_seed(1000 * config.seed + draw)
     count = views or config.views
-    rotations = rotations_of(torch.randn(count, 4, generator=generator, dtype=torch.float64))
+    rotations = rotations_of(F.normalize(torch.randn(count, 4, generator=generator, dtype=torch.float64), dim=-1))
     centers = torch.rand(count, 3, 1, generator=generator, dtype=torch.float64) * 1.6 - 0.8
     half_angle = torch.deg2rad(20 + 15 * torch.rand(count, 1, generator=generator, dtype=torch.float64))
     cameras = Pinholes(

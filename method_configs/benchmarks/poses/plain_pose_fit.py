@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import rotations_of
 
 
 def fit_cameras_plainly(
@@ -51,7 +52,7 @@ def fit_cameras_plainly(
     optimizer = torch.optim.AdamW([quaternions, centers, focal], lr=rate)
     for _ in range(steps):
         in_camera = torch.cat([pixels / focal[:, None], torch.ones_like(pixels[..., :1])], dim=-1)
-        directions = F.normalize(in_camera @ rotations_of(quaternions).transpose(1, 2), dim=-1)
+        directions = F.normalize(in_camera @ rotations_of(F.normalize(quaternions, dim=-1)).transpose(1, 2), dim=-1)
         ends = centers[:, None] + directions - rays[..., :3] - rays[..., 3:]
         loss = (ends.abs() * shares).sum() + ((rays[..., :3] - centers[:, None]).abs() * shares).sum()
         optimizer.zero_grad()
@@ -59,20 +60,9 @@ def fit_cameras_plainly(
         optimizer.step()
     with torch.no_grad():
         return Pinholes(
-            camera_to_world=torch.cat([rotations_of(quaternions), centers[..., None]], dim=2),
+            camera_to_world=torch.cat([rotations_of(F.normalize(quaternions, dim=-1)), centers[..., None]], dim=2),
             focal=focal * focal.new_tensor([width / 2, height / 2]),
             principal=middle.clone(),
             width=width,
             height=height,
         )
-
-
-def rotations_of(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length but zero."""
-    w, x, y, z = F.normalize(quaternions, dim=-1).unbind(dim=-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

@@ -34,7 +34,9 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.camera_paths import PATHS, path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
 from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster
-from fb_core.machine.resources import peak_memory_bytes, usable_device
+from fb_core.machine.clock import Clock
+from fb_core.machine.devices import chosen_device
+from fb_core.machine.resources import peak_memory_bytes
 from method_configs.commands.complete.forecast import forecast
 from method_configs.commands.complete.options import CHECKED, CompleteOptions, Plan, pose_sampling
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
@@ -70,7 +72,7 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
     target.check()
     scene = options.frames == "scene" and not options.poses_only
     _require_usable(options, scene=scene)
-    clock = _Clock()
+    clock = Clock()
     with clock.stage("reading"):
         job = _read(source, options)
     target = _with_pictures(target, job.photos)
@@ -109,7 +111,7 @@ def _require_usable(options: CompleteOptions, *, scene: bool) -> None:
     """Raises ValueError in one sentence, before photos are read and cameras looked for, which takes minutes: for a
     device, a path, known cameras, a model or a prompt that cannot be used. Weights are mapped, not read.
     """
-    usable_device(options.device)
+    chosen_device(options.device)
     _path_of_file(options, _CHECKED_SIDE)
     if options.known_poses is not None:
         read_capture(options.known_poses)
@@ -248,7 +250,7 @@ def _same_file(one: Path, other: Path) -> bool:
 def _load_model(options: CompleteOptions, *, needed: bool) -> Fillerbuster | None:
     if not needed:
         return None
-    device = usable_device(options.device)
+    device = chosen_device(options.device)
     model = Fillerbuster.from_pretrained(options.model, device=device, text_encoder=options.text_encoder)
     _require_readable(options, reads_text=model.reads_text)
     return model
@@ -263,7 +265,7 @@ def _require_readable(options: CompleteOptions, *, reads_text: bool) -> None:
 
 
 def _work(
-    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path | None = None
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock, work: Path | None = None
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
     """Cameras, then new views; what the report is to say of these. With a folder to work in, a scene and its film."""
     if work is not None:
@@ -322,7 +324,7 @@ def _work(
     return found, new, told
 
 
-def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock) -> FoundCameras:
+def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock) -> FoundCameras:
     """And say what was found."""
     sampling = None if model is None else pose_sampling(model, options)
     with _bars() as on_progress, clock.stage("cameras"):
@@ -340,7 +342,7 @@ def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None
 
 
 def _work_on_scene(
-    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: _Clock, work: Path
+    job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock, work: Path
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
     """Cameras, splats, new views where they are needed, a film; what an earlier try has kept is not done again."""
     from method_configs.commands.complete.scene import SceneJob, complete_with_splats
@@ -422,21 +424,6 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[what], completed=done, total=total)
 
         yield report
-
-
-class _Clock:
-    """Seconds of each stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = round(time.perf_counter() - began, 2)
 
 
 def _peak_memory_gib() -> float:

@@ -29,15 +29,15 @@ from fb_core.data.capture.captures import FrameToWrite, read_capture, write_capt
 from fb_core.data.capture.frames import Capture
 from fb_core.data.capture.point_cloud import Points
 from fb_core.data.capture.points import read_points
-from fb_core.data.capture.transforms_json import to_opengl
 from fb_core.data.photos.photo import Photo
 from fb_core.files.json_files import read_json
 from fb_core.files.whole import whole_file
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import flip_axes
 from fb_core.geometry.similarity import Similarity
 from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
-from fb_core.machine.resources import usable_device
+from fb_core.machine.devices import chosen_device
 from fb_core.memory.budget import GIB
 from fb_nerfstudio.splats.backend import BLUR
 from fb_nerfstudio.splats.scene_film import FilmFrame, film_frame, seen_by_photos
@@ -83,7 +83,7 @@ class SceneJob:
             cameras=[found.camera(index).to(torch.float64) for index in found.trusted],
             points_path=points_path,
             options=options,
-            device=str(usable_device(options.device)),
+            device=str(chosen_device(options.device)),
             work=work,
         )
 
@@ -317,7 +317,7 @@ def completion_of(job: SceneJob, budget: SceneBudget) -> CompletionConfig:
 
 def _as_camera_path(cameras: Pinholes) -> dict[str, Any]:
     """The path as nerfstudio's viewer saves it."""
-    poses = to_opengl(cameras.camera_to_world)
+    poses = flip_axes(cameras.camera_to_world)
     corner = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=poses.dtype)
     degrees = torch.rad2deg(2 * torch.atan(cameras.height / 2 / cameras.focal[:, 1]))
     return {

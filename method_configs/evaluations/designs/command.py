@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from fb_core.networks.transformer.dit import DiT
     from fb_core.training.kept_batches import KeptBatches
     from fb_core.training.recipe import Recipe
-    from fb_core.training.run.loop import Run, Stage
+    from fb_core.training.run.loop import Run
+    from fb_core.training.run.stage import Stage
     from method_configs.evaluations.designs.stages import KeptStage
     from method_configs.evaluations.designs.task import AskedRooms, DesignTask
 
@@ -47,7 +48,7 @@ def base_recipe() -> Recipe:
     """The small training that all designs are one change away from: the paper's design on rooms of 64 pixels."""
     from fb_core.data.training.task import TaskConfig
     from fb_core.networks.transformer.dit import DiTConfig
-    from fb_core.training.run.loop import EngineConfig
+    from fb_core.training.run.options import EngineConfig
     from fb_core.training.stages.dit_stage import DiTLossConfig
     from method_configs.presets import ROOMS_ABLATION
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from fb_core.networks.transformer.dit import NO_FACTS, DiT, DiTConfig, TokenFacts
 from fb_core.training.kept_batches import KeptBatches
-from fb_core.training.run.loop import Stage
+from fb_core.training.run.stage import Stage
 from fb_core.training.stages.dit_stage import DiTStage, Drawn, Encoded
 
 LEAST_TIME = 0.05

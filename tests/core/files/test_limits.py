@@ -28,7 +28,7 @@ from fb_core.files.json_files import parse_json, read_json
 from fb_core.inpainter import BUNDLED_MODEL
 from fb_core.networks.weights import require_plain
 from fb_core.sampling.options import SamplingConfig
-from fb_core.training.run.loop import LoopConfig
+from fb_core.training.run.options import LoopConfig
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.train_options import TrainOptions
 

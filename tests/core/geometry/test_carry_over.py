@@ -15,7 +15,7 @@ from fb_core.evaluation.completion import unseen_room
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import BELIEF_BY_DIRECTION, BELIEF_OF_RENDERS, carried_over
 from fb_core.geometry.raymap import raymaps_of
-from fb_core.training.run.loop import row_generator
+from fb_core.training.run.stage import row_generator
 from fb_core.training.stages.guesses import guesses_of
 
 TASK = TaskConfig(views=6, ray_task=0.0, dropout=0.0, partial_share=0.0, known_share=(0.5, 0.5), guess=1.0)

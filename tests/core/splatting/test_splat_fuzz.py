@@ -15,7 +15,7 @@ from helpers.scenes.rasterizer_scenes import scene
 from torch import Tensor
 
 from fb_core.splatting.rasterizer import rasterization
-from fb_nerfstudio.splats.mcmc import CappedMCMC, position_noise, shared_opacity_and_scale
+from fb_nerfstudio.splats.strategies.mcmc import CappedMCMC, position_noise, shared_opacity_and_scale
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
 DTYPES = (torch.float32, torch.float32, torch.float64, torch.float16, torch.bfloat16)

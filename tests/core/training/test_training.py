@@ -17,7 +17,9 @@ from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.training.recipe import STAGES, export, run_stage
-from fb_core.training.run.loop import LoopConfig, Run, Stage, row_generator
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import LoopConfig
+from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.dit_stage import encode_sequences
 from fb_core.training.stages.linear_start import start_linear
 from fb_core.training.stages.vae_stage import kl_divergence, reconstruction_error

@@ -9,7 +9,7 @@ import torch
 from helpers.scenes.completions import UP
 
 from fb_core.geometry.cameras import Pinholes
-from fb_nerfstudio.bridge import flip_axes
+from fb_core.geometry.rotations import flip_axes
 
 
 def write_path(file: Path, count: int = 7, *, width: int = 64, height: int = 36, fov: float = 50.0, **changes) -> Path:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import torch
 
-from fb_core.data.capture.colmap.model import quaternions_of
 from fb_core.data.capture.colmap.reader import CAMERA_MODELS
 from fb_core.data.capture.frames import Capture
+from fb_core.geometry.rotations import quaternions_of
 
 Camera = tuple[str, int, int, Sequence[float]]
 """Model, width, height, parameters."""

@@ -19,7 +19,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
 from fb_core.data.capture.captures import read_capture, validate_capture
-from fb_nerfstudio.bridge import flip_axes
+from fb_core.geometry.rotations import flip_axes
 from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d
 from fb_nerfstudio.capture.pictures import CapturePictures
 

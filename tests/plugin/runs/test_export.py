@@ -26,12 +26,13 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
 from fb_core.data import media
 from fb_core.data.capture.captures import FrameToWrite, read_capture, validate_capture, write_capture
-from fb_core.data.capture.colmap.model import ColmapImage, quaternions_of, rotations_of, write_colmap
+from fb_core.data.capture.colmap.model import ColmapImage, write_colmap
 from fb_core.data.capture.point_cloud import Points
 from fb_core.data.capture.points import read_points
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import quaternions_of, rotations_of
 from fb_core.geometry.similarity import Similarity, nearest_rotations
 from fb_nerfstudio.capture.dataparser import without_open3d
 from fb_nerfstudio.runs import export as export_module

@@ -10,8 +10,8 @@ from helpers.plugin.splat_models import camera, held, make_model, make_optimizer
 from torch import Tensor
 from twins.dense_rasterizer import covariance
 
-from fb_nerfstudio.splats.mcmc import CappedMCMC, penalize, position_noise, shared_opacity_and_scale
 from fb_nerfstudio.splats.splat_model import FillerbusterSplatModel, FillerbusterSplatModelConfig
+from fb_nerfstudio.splats.strategies.mcmc import CappedMCMC, penalize, position_noise, shared_opacity_and_scale
 
 BEHIND = torch.tensor([0.0, -8.0, 0.5])  # behind the camera of these tests
 

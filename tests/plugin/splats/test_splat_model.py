@@ -73,8 +73,8 @@ def test_training_fits_an_image() -> None:
 def test_resolution_schedule_divides_focal_and_floors_size() -> None:
     model = make_model(num_downscales=2, resolution_schedule=10)
     model.train()
-    pinhole = model._pinhole(camera(SIZE + 3))
-    full = model.eval()._pinhole(camera(SIZE + 3))
+    pinhole = model.drawn_camera(camera(SIZE + 3))
+    full = model.eval().drawn_camera(camera(SIZE + 3))
     assert (pinhole.width, pinhole.height) == ((SIZE + 3) // 4, (SIZE + 3) // 4)
     assert torch.allclose(pinhole.focal * 4, full.focal) and torch.allclose(pinhole.principal * 4, full.principal)
     train_step(

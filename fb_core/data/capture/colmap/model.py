@@ -12,12 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from fb_core.data.capture.point_cloud import Points
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.rotations import quaternions_of, rotations_of
 from fb_core.geometry.similarity import nearest_rotations
 
 _PINHOLE_ID, _PINHOLE_NAME = 1, "PINHOLE"
@@ -54,36 +51,6 @@ def write_colmap(folder: Path, images: Sequence[ColmapImage], points: Points) ->
     _write_cameras(folder, {number: intrinsics for intrinsics, number in cameras.items()})
     _write_images(folder, [image.name for image in images], numbers, poses)
     _write_points(folder, points)
-
-
-def quaternions_of(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Unit quaternions (w, x, y, z; w >= 0) of rotations, in float64, accurate for every angle.
-
-    The eigenvector of Bar-Itzhack's symmetric 4 x 4 matrix to its largest eigenvalue; for exact rotations that
-    eigenvalue is 1.
-    """
-    r = rotations.double()
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    rows = [
-        [xx + yy + zz, r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]],
-        [r[:, 2, 1] - r[:, 1, 2], xx - yy - zz, r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0]],
-        [r[:, 0, 2] - r[:, 2, 0], r[:, 0, 1] + r[:, 1, 0], yy - xx - zz, r[:, 1, 2] + r[:, 2, 1]],
-        [r[:, 1, 0] - r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1], zz - xx - yy],
-    ]
-    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) / 3
-    quaternions = torch.linalg.eigh(matrix).eigenvectors[..., -1]
-    return torch.where(quaternions[:, :1] < 0, -quaternions, quaternions)
-
-
-def rotations_of(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotations of unit quaternions (w, x, y, z); the inverse of :func:`quaternions_of`."""
-    w, x, y, z = quaternions.double().unbind(dim=-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def _intrinsics(camera: Pinholes) -> tuple:

@@ -456,7 +456,7 @@ def test_all_three_stages_learn_from_captures_and_captioned_pictures(tiny_captur
     from fb_core.networks.transformer.dit import DiTConfig
     from fb_core.networks.vae import VAEConfig
     from fb_core.training.recipe import STAGES, Recipe, export, run_stage
-    from fb_core.training.run.loop import LoopConfig
+    from fb_core.training.run.options import LoopConfig
     from fb_core.training.stages.dit_stage import DiTLossConfig
     from fb_core.training.stages.vae_stage import VAELossConfig
 

@@ -17,7 +17,9 @@ from helpers.tiny_training import LOOP, TinyStage, losses_of, run_in
 
 from fb_core.data.training.sequences import PoolConfig, RoomPool, TaskConfig
 from fb_core.training.run.distributed import ALONE, Group
-from fb_core.training.run.loop import EngineConfig, Run, row_generator
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import EngineConfig
+from fb_core.training.run.stage import row_generator
 
 ROOT = Path(__file__).resolve().parents[4]
 

@@ -25,8 +25,10 @@ from fb_core.training import dry_run
 from fb_core.training.recipe import make_sheet, make_stage
 from fb_core.training.run.checkpoints import read_state
 from fb_core.training.run.distributed import ALONE
-from fb_core.training.run.loop import EngineConfig, LoopConfig, Run, Stage
+from fb_core.training.run.loop import Run
+from fb_core.training.run.options import EngineConfig, LoopConfig
 from fb_core.training.run.progress_log import ProgressLog
+from fb_core.training.run.stage import Stage
 from method_configs.commands.train_options import TrainOptions
 
 ROOT = Path(__file__).resolve().parents[4]

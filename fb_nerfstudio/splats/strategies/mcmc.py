@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fb_core.splatting.footprint import rotations, unit_quaternions
-from fb_nerfstudio.splats.densification import append_rows
+from fb_nerfstudio.splats.strategies.densification import append_rows
 
 _MOST_COPIES = 51
 """Copies at one place that the new opacity and scale account for, as in gsplat."""
