@@ -61,7 +61,7 @@ def test_the_papers_column(tmp_path: Path, monkeypatch):
     [
         ({"sizes": (100,)}, "multiples of 16 pixels, got 100"),
         ({"views": ()}, "expected numbers of views"),
-        ({"device": "moon"}, "device: expected cpu, cuda or cuda:N, got 'moon'"),
+        ({"device": "moon"}, "device: expected one that this machine has, such as cpu, cuda or cuda:N, got 'moon'"),
     ],
 )
 def test_bad_options_are_told(options, said):
