@@ -46,12 +46,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fillerbuster"
 
 
-def compile_libraries(compiler: str | None = None) -> list[Path]:
+def compiler_here() -> str | None:
+    """The program that the environment variable CC names, or the first usual one that is installed; None without."""
+    return os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
+
+
+def compile_libraries() -> list[Path]:
     """Compile for single and double precision, which takes some seconds each; what is there already is made anew.
 
     Raises NoCompiler where there is no compiler or it fails, and CannotWrite where the folder cannot be written.
     """
-    program = compiler or os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
+    program = compiler_here()
     if program is None or shutil.which(program) is None:
         raise NoCompiler(
             f"compile: expected a C compiler, one of {', '.join(_COMPILERS)} or the one that CC names, found "
