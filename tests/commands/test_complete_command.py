@@ -365,8 +365,8 @@ def test_wishes_that_cannot_be_met_are_refused(tmp_path: Path, model: Path, caps
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--device", "toaster"), "device: expected cpu, cuda or cuda:N, got 'toaster'"),
-        (("--device", "meta"), "device: expected one that this machine has, such as cpu, got 'meta'"),
+        (("--device", "toaster"), "device: expected one that this machine has, such as cpu, cuda or cuda:N, got"),
+        (("--device", "meta"), "device: expected one that this machine has, such as cpu, cuda or cuda:N, got 'meta'"),
         (("--path", "loop"), "--path: expected ellipse, orbit, spiral"),
         (("--path", "missing.json"), "camera path missing.json: no such file"),
         (("--known-poses", "missing"), "missing: no such folder"),

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from helpers.folders.owned import files, marked, refusal
@@ -16,11 +17,11 @@ from helpers.tiny_models import save_tiny_model
 
 from fb_core import checkpoint
 from fb_core.checkpoint import model_hash
-from fb_core.completion.results.completed_views import views_target
+from fb_core.completion.results.completed_views import CompletedViews, views_target
 from fb_core.data.capture.captures import read_capture
 from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of
 from fb_core.files.whole import whole_folder
-from fb_nerfstudio.datamanager import FillerbusterDataManager
+from fb_nerfstudio.generation.generation import Generation
 from fb_nerfstudio.runs.earlier_runs import clear_run
 from method_configs.commands import command_line as commands
 from method_configs.commands import demo
@@ -271,18 +272,19 @@ def test_a_training_replaces_its_own_views_alone(tmp_path: Path, tiny_capture: P
     shutil.copytree(tiny_capture, run / "completion")
     before = files(tmp_path)
 
-    class Trainer:
-        base_dir = run
-
-    class Manager:
-        generated_views = generated_views()
-        config = type("Config", (), {"data": tiny_capture, "dataparser": None})
-        train_dataparser_outputs = _pictures_of(tiny_capture)
-
     for views in (generated_views(), None):
-        Manager.generated_views = views
-        assert FillerbusterDataManager._save_bank(Manager(), Trainer()) is None  # type: ignore[arg-type]
+        assert saved(views, run, tiny_capture) is None
     assert files(tmp_path) == before and "the generated views are in the checkpoint alone" in caplog.text
+
+
+def saved(views: CompletedViews | None, run: Path, capture: Path) -> Path | None:
+    """Where a training on a capture has saved its views, in the run's folder."""
+    captured = SimpleNamespace(
+        config=SimpleNamespace(data=capture, dataparser=None), train_dataparser_outputs=_pictures_of(capture)
+    )
+    state = SimpleNamespace(views=views, trust=None, rounds=SimpleNamespace(record=[]))
+    generation: Any = SimpleNamespace(trainer=SimpleNamespace(base_dir=run), captured=captured, state=state)
+    return Generation.save_views(generation)
 
 
 def _pictures_of(capture: Path) -> SimpleNamespace:
@@ -298,25 +300,13 @@ def test_a_run_within_its_capture_keeps_all_of_its_rounds(tmp_path: Path, tiny_c
     room = shutil.copytree(tiny_capture, tmp_path / "outputs" / "room")
     run = room / "fillerbuster" / "first"
 
-    class Trainer:
-        base_dir = run
-
-    class Manager:
-        generated_views = generated_views()[[0]]
-        config = type("Config", (), {"data": room, "dataparser": None})
-        train_dataparser_outputs = _pictures_of(room)
-        _trust, _rounds = None, SimpleNamespace(record=[])
-
     captured = files(room)
     for views in (generated_views()[[0]], generated_views()):
-        Manager.generated_views = views
-        assert FillerbusterDataManager._save_bank(Manager(), Trainer()) == run / "completion"  # type: ignore[arg-type]
+        assert saved(views, run, room) == run / "completion"
         assert len(list((run / "completion" / "images").iterdir())) == len(views)
     assert files(room).items() >= captured.items() and not caplog.records
-    Manager.config.data = run / "completion"  # what it reads it does not replace, whatever the mark says
-    Manager.train_dataparser_outputs = _pictures_of(run / "completion")
-    before = files(room)
-    assert FillerbusterDataManager._save_bank(Manager(), Trainer()) is None  # type: ignore[arg-type]
+    before = files(room)  # what it reads it does not replace, whatever the mark says
+    assert saved(generated_views(), run, run / "completion") is None
     assert files(room) == before and "holds the input" in caplog.text
 
 
