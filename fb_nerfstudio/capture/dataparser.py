@@ -133,8 +133,11 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         )
 
     def _world_of(self, capture: Capture) -> tuple[list[Frame], _World]:
-        """All frames in the parent's order, that of their names, and the world that they are trained in."""
-        frames = sorted(capture.frames, key=lambda frame: frame.image_path)
+        """All frames that are of use, in the parent's order, that of their names, and the world that they are trained
+        in. Frames that are marked as bad decide nothing: their poses may lie anywhere.
+        """
+        usable = [frame for frame in capture.frames if not frame.is_bad]
+        frames = sorted(usable or capture.frames, key=lambda frame: frame.image_path)
         poses = flip_axes(torch.cat([frame.camera.camera_to_world for frame in frames]))  # float64, OpenGL
         shift = poses[:, :, 3].mean(dim=0) if self._is_far(capture) else torch.zeros(3, dtype=torch.float64)
         near = torch.cat([poses[:, :, :3], poses[:, :, 3:] - shift[:, None]], dim=2).float()
@@ -160,7 +163,8 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         """Whether the capture lies so far off the origin that single precision would move its cameras (geo-referenced
         ones do).
         """
-        centers = capture.poses[:, :, 3]
+        usable = [number for number, frame in enumerate(capture.frames) if not frame.is_bad]
+        centers = capture.poses[usable or slice(None), :, 3]
         spread = float((centers - centers.mean(dim=0)).abs().max())
         return float(centers.abs().max()) > max(_FAR_OFF * spread, 1.0 / _ONE_PLACE)
 
@@ -173,7 +177,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         listed = {
             name: _listed(capture, name) for name in ("train", "val", "test") if f"{name}_filenames" in capture.extra
         }
-        names = {_name(frame.image_path) for frame in frames}
+        names = {_name(frame.image_path) for frame in capture.frames}
         for name, files in listed.items():
             if foreign := sorted(files - names):
                 _logger.warning(

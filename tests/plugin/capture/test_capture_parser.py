@@ -244,6 +244,21 @@ def test_frames_marked_as_bad_are_left_out(tiny_capture: Path) -> None:
     assert len(outputs(tiny_capture, eval_mode="all").image_filenames) == len(read_capture(tiny_capture).photos) == 5
 
 
+def test_frames_marked_as_bad_decide_nothing_of_the_world(tiny_capture: Path) -> None:
+    """A scan's software marks frames whose pose it has lost; that pose may lie anywhere."""
+    edited(tiny_capture, lambda meta: meta["frames"][1].update(is_bad=True))
+    before = outputs(tiny_capture, eval_mode="all")
+
+    def lost(meta: dict) -> None:
+        for row in meta["frames"][1]["transform_matrix"][:3]:
+            row[3] = 4e4
+
+    edited(tiny_capture, lost)
+    after = outputs(tiny_capture, eval_mode="all")
+    assert torch.equal(after.cameras.camera_to_worlds, before.cameras.camera_to_worlds)
+    assert float(after.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1, abs=1e-5)
+
+
 def test_points_that_are_not_finite_are_left_out(tiny_capture: Path) -> None:
     capture = read_capture(tiny_capture)
     assert capture.points_path is not None

@@ -69,6 +69,9 @@ def test_a_barrel_lens_is_straightened():
     assert result["rotation_degrees"] < 0.2 and result["center"] < 0.02
     bent = next(iter(found.straight.values()))
     assert not bent.stored and any("straightened" in note for note in found.notes)
+    assert bent.bent is not None
+    lens, told = bent.bent[0].focal.mean(), truth[0].focal.mean()
+    assert abs(float(lens / told) - 1) < 0.01, (lens, told)
 
 
 @pytest.mark.slow
