@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import logging
 import os
 import platform
 import shutil
@@ -26,6 +27,7 @@ CACHE_VARIABLE = "FILLERBUSTER_CACHE"
 _OPTIONS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 _DEFINES = {torch.float32: (), torch.float64: ("-DDOUBLE",)}
 _COMPILERS = ("cc", "gcc", "clang")
+_logger = logging.getLogger(__name__)
 
 
 class NoCompiler(ValueError):
@@ -84,16 +86,22 @@ def compile_libraries() -> list[Path]:
 
 @cache
 def loaded(dtype: torch.dtype) -> ctypes.CDLL | None:
-    """The library for tensors of this dtype; None where it has not been made, or where others may write to it."""
+    """The library for tensors of this dtype; None where it has not been made, where it cannot be loaded (said once), or
+    where others may write to it.
+    """
     if dtype not in _DEFINES:
         return None
     path = library_path(dtype)
     if not path.is_file() or not (_private(path.parent) and _private(path)):
         return None
-    library = ctypes.CDLL(str(path))
-    library.fb_strips.restype = ctypes.c_int64
-    for name in ("fb_fill", "fb_forward", "fb_backward", "fb_add_rows"):
-        getattr(library, name).restype = None
+    try:
+        library = ctypes.CDLL(str(path))
+        library.fb_strips.restype = ctypes.c_int64
+        for name in ("fb_fill", "fb_forward", "fb_backward", "fb_add_rows"):
+            getattr(library, name).restype = None
+    except (OSError, AttributeError):
+        _logger.warning("%s cannot be loaded; torch draws. `fillerbuster compile` makes it anew.", path)
+        return None
     return library
 
 

@@ -185,6 +185,18 @@ def test_a_library_that_others_may_write_is_not_loaded(compiled_library: Path) -
         path.chmod(0o700)
 
 
+def test_a_file_that_is_no_library_is_said_and_torch_draws(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(library.CACHE_VARIABLE, str(tmp_path))
+    library.library_path(torch.float64).write_bytes(b"no library")
+    library.loaded.cache_clear()
+    inputs = scene()
+    assert torch.equal(drawn(inputs, "auto")["picture"], drawn(inputs, "torch")["picture"])
+    assert caplog.text.count("`fillerbuster compile` makes it anew") == 1
+    library.loaded.cache_clear()
+
+
 def test_without_a_compiler_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(library.CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setenv("CC", "no-such-compiler")
