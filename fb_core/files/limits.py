@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from fb_core.machine.resources import free_memory_bytes
@@ -25,6 +26,8 @@ MOST_SAMPLING_STEPS = 10_000
 """Of one sampling."""
 MOST_TRAINING_STEPS = 10**9
 """Of one stage of a training."""
+MOST_SEED = 2**32 - 1
+"""Of whatever is drawn (NumPy takes no larger one)."""
 _DECODED_BYTES = 9  # per pixel and channel while a picture is read: 8 bits, 32 bits, and 32 bits upright
 _GIB = 2**30
 _MODEL = {
@@ -61,6 +64,17 @@ def require_whole(name: str, value: object, least: int, most: int | None = None)
         raise ValueError(f"{name}: expected at least {least}, got {_short(int(value))}")
     if most is not None:
         require_between(name, int(value), least, most)
+
+
+def require_text_name(path: Path) -> None:
+    """Raise a ValueError for a path whose bytes are no text in UTF-8, which the libraries for pictures and films do not
+    take.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        shown = str(path).encode(errors="backslashreplace").decode()
+        raise ValueError(f"{shown}: expected a name in UTF-8, got other bytes; rename it") from None
 
 
 def require_model_sizes(sizes: Mapping[str, Any]) -> None:

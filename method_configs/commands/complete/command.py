@@ -36,8 +36,9 @@ from fb_core.inpainter import Fillerbuster
 from fb_core.machine.clock import Clock
 from fb_core.machine.resources import peak_memory_bytes
 from method_configs.commands.complete.forecast import forecast
-from method_configs.commands.complete.options import CHECKED, CompleteOptions, Plan, pose_sampling
+from method_configs.commands.complete.options import CHECKED, CompleteOptions
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
+from method_configs.commands.complete.plan import Plan, pose_sampling
 from method_configs.commands.complete.report import announcement, no_cameras, report_of, what_was_found
 
 _WORKING = {
