@@ -50,10 +50,9 @@ def training_mixture(
     known: int | None = None,
     unknown: int | None = None,
     in_order: bool = False,
-    device: torch.device | str = "cpu",
 ) -> Float[Tensor, "n 1 h w"]:
-    """Masks of one training sequence: by default a quarter of the views known, half unknown, the rest partly known, in
-    random order.
+    """Masks of one training sequence, on the CPU: by default a quarter of the views known, half unknown, the rest
+    partly known, in random order.
 
     ``known`` and ``unknown`` override the two counts (the released code's split is n//4 and n//2). ``in_order`` keeps
     known views first, then unknown ones, then the rest, as in the paper's evaluation.
@@ -64,11 +63,11 @@ def training_mixture(
     unknown = count // 2 if unknown is None else unknown
     if known + unknown > count:
         raise ValueError(f"training mixture: {known} known and {unknown} unknown views do not fit into {count} views")
-    masks = torch.zeros(count, 1, height, width, device=device, dtype=torch.float32)
+    masks = torch.zeros(count, 1, height, width, dtype=torch.float32)
     order = torch.arange(count) if in_order else torch.randperm(count, generator=generator)
     masks[order[:known]] = 1.0
     for view in order[known + unknown :].tolist():
-        masks[view] = partly_known(height, width, generator=generator, device=device)
+        masks[view] = partly_known(height, width, generator=generator)
     return masks
 
 

@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def options_of(given: argparse.Namespace) -> TrainOptions:
-    """What was asked for."""
+    """What was asked for. Raises ValueError for steps or minutes that are not positive."""
     values = vars(given)
     data = TrainingData(**{field.name: values[field.name] for field in dataclasses.fields(TrainingData)})
     own = {field.name: values[field.name] for field in dataclasses.fields(TrainOptions) if field.name != "data"}

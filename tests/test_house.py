@@ -14,10 +14,10 @@ LONG_FILES = {
     "fb_core/completion/planning/plan.py",
     "fb_core/data/capture/captures.py",
     "method_configs/commands/complete/command.py",
-    "method_configs/commands/complete/scene.py",
+    "method_configs/commands/complete/scenes/scene.py",
 }
-TALL_FUNCTIONS = 4
-MANY_ARGUMENTS = 31
+TALL_FUNCTIONS = 3
+MANY_ARGUMENTS = 24
 
 
 @pytest.fixture(name="counts", scope="module")

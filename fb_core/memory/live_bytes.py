@@ -107,9 +107,8 @@ def _convolved(
     return x.new_empty(x.shape[0], weight.shape[0], *sides)
 
 
-def _group_normed(
-    x: Tensor, weight: Any, bias: Any, count: int, channels: int, places: int, groups: int, eps: float
-) -> tuple:
+def _group_normed(x: Tensor, weight: Any, bias: Any, *sizes: Any) -> tuple:
+    count, _channels, _places, groups, _eps = sizes
     return torch.empty_like(x), x.new_empty(count, groups), x.new_empty(count, groups)
 
 

@@ -8,14 +8,13 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import nn
 
 from fb_core import checkpoint
 from fb_core.conditioning import encode_frozen
-from fb_core.data.training.folders import Resolution, at_resolutions, multi_view_source, training_source
+from fb_core.data.training.folders import Resolution, Wanted, at_resolutions, multi_view_source, training_source
 from fb_core.data.training.named_data import TrainingData
 from fb_core.data.training.sequences import PoolConfig
 from fb_core.data.training.task import Source
@@ -30,7 +29,7 @@ from fb_core.training.run.checkpoints import Checkpoints, read_state
 from fb_core.training.run.distributed import ALONE, Group
 from fb_core.training.run.loop import OnProgress, OnSheet, Run
 from fb_core.training.run.options import EngineConfig, LoopConfig
-from fb_core.training.sample_sheets import reconstruction_sheet, room_sheet
+from fb_core.training.sample_sheets import UnseenRooms, reconstruction_sheet, room_sheet
 from fb_core.training.stages.dit_stage import DiTLossConfig, DiTStage, EncodeText, SharedBatches
 from fb_core.training.stages.linear_start import start_linear
 from fb_core.training.stages.perceptual import load_lpips
@@ -170,18 +169,20 @@ def dit_stage(
 def sequences_of(recipe: Recipe, image_vae: VAE, device: torch.device | str = "cpu") -> Source:
     """The transformer's data: at one size, and from some step on at one of several in each step."""
     precision = resolved(recipe.engine.precision, device)
-    shared: dict[str, Any] = {
-        "seed": recipe.seed + 1,
-        "device": device,
-        "single_share": recipe.single_view_share,
-        "encode": lambda images: encode_frozen(image_vae, images, 64, precision),
-    }
-    source = training_source(recipe.data, recipe.pool, per_row=recipe.dit_loss.images_per_row, **shared)
+    wanted = Wanted(
+        data=recipe.data,
+        pool=recipe.pool,
+        single_share=recipe.single_view_share,
+        seed=recipe.seed + 1,
+        device=device,
+        encode=lambda images: encode_frozen(image_vae, images, 64, precision),
+    )
+    source = training_source(wanted, per_row=recipe.dit_loss.images_per_row)
     if not recipe.resolutions:
         return source
     sizes = ", ".join(str(one.image_size) for one in recipe.resolutions)
     _logger.info("views of %s pixels in turn from step %d on", sizes, recipe.resolutions_from)
-    return at_resolutions(source, recipe.resolutions, recipe.resolutions_from, recipe.data, recipe.pool, **shared)
+    return at_resolutions(source, recipe.resolutions, wanted, from_step=recipe.resolutions_from)
 
 
 def _encode_text(recipe: Recipe, device: torch.device | str, *, stands_in: bool) -> EncodeText:
@@ -214,13 +215,11 @@ def make_sheet(recipe: Recipe, task: VAEStage | DiTStage) -> OnSheet:
     """What draws a stage's sample sheets: an unseen room, reconstructed by an autoencoder or completed by the
     transformer.
     """
-    family, views, size = recipe.pool.families[-1], recipe.dit_loss.task.views, recipe.pool.image_size
+    rooms = UnseenRooms(family=recipe.pool.families[-1], views=recipe.dit_loss.task.views, size=recipe.pool.image_size)
     if isinstance(task, VAEStage):
-        return reconstruction_sheet(task.network.config, family=family, views=views, size=size, device=_device_of(task))
+        return reconstruction_sheet(task.network.config, rooms, device=_device_of(task))
     vaes = {"image_vae": task.image_vae, "raymap_vae": task.raymap_vae}
-    return room_sheet(
-        recipe.dit, **vaes, family=family, views=views, size=size, sampling=recipe.sampling, device=_device_of(task)
-    )
+    return room_sheet(recipe.dit, rooms, **vaes, sampling=recipe.sampling, device=_device_of(task))
 
 
 def _device_of(task: VAEStage | DiTStage) -> torch.device:
@@ -232,16 +231,17 @@ def _vae_stage(recipe: Recipe, kind: str, device: torch.device | str) -> tuple[V
         "image-vae": (recipe.image_vae_loss, recipe.image_vae_loop),
         "raymap-vae": (recipe.raymap_vae_loss, recipe.raymap_vae_loop),
     }[kind]
-    shared: dict[str, Any] = {"seed": recipe.seed + 1, "device": device}
     perceptual = None
     if kind == "image-vae":  # learns from all data; raymaps come from multi-view data alone (paper)
-        pool = training_source(recipe.data, recipe.vae_pool, single_share=recipe.single_view_share, per_row=1, **shared)
+        share = recipe.single_view_share
+        wanted = Wanted(data=recipe.data, pool=recipe.vae_pool, single_share=share, seed=recipe.seed + 1, device=device)
+        pool = training_source(wanted, per_row=1)
         if loss.perceptual and recipe.data.lpips is not None:
             perceptual = load_lpips(recipe.data.lpips).to(device)
         elif loss.perceptual:
             _logger.warning("the perceptual loss is left out: no file with the weights of LPIPS's backbone was named")
     else:
-        pool = multi_view_source(recipe.data, recipe.vae_pool, with_images=False, **shared)
+        pool = multi_view_source(recipe.data, recipe.vae_pool, with_images=False, seed=recipe.seed + 1, device=device)
     return VAEStage(
         _new_vae(recipe, kind).to(device), pool, kind=kind, config=loss, seed=recipe.seed, perceptual=perceptual
     ), loop

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -32,14 +33,30 @@ _Network = TypeVar("_Network", DiT, VAE)
 _VALIDATED_ROOMS = 4
 
 
+@dataclass(frozen=True, kw_only=True)
+class UnseenRooms:
+    """Rooms that no training sees."""
+
+    family: str
+    """Of rooms."""
+    views: int
+    """Of each room."""
+    size: int
+    """Side of the views in pixels."""
+
+    def room(self, number: int) -> RoomViews:
+        """One of them, the same every time."""
+        from fb_core.evaluation.completion import unseen_room
+
+        return unseen_room(family=self.family, seed=0, number=number, views=self.views, size=self.size)
+
+
 def room_sheet(
     config: DiTConfig,
+    unseen: UnseenRooms,
     *,
     image_vae: VAE,
     raymap_vae: VAE,
-    family: str,
-    views: int,
-    size: int,
     sampling: SamplingConfig,
     device: torch.device,
 ) -> OnSheet:
@@ -50,12 +67,7 @@ def room_sheet(
 
     @cache
     def unseen_rooms() -> list[RoomViews]:
-        from fb_core.evaluation.completion import unseen_room
-
-        return [
-            unseen_room(family=family, seed=0, number=number, views=views, size=size)
-            for number in range(_VALIDATED_ROOMS)
-        ]
+        return [unseen.room(number) for number in range(_VALIDATED_ROOMS)]
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
         from fb_core.evaluation.ablations import conditional_validation_loss
@@ -64,7 +76,7 @@ def room_sheet(
         architecture = ModelConfig(transformer=config, image_vae=image_vae.config, raymap_vae=raymap_vae.config)
         dit = _with_weights(DiT(config), state, device)
         model = Fillerbuster(Loaded(dit=dit, image_vae=image_vae, raymap_vae=raymap_vae, config=architecture))
-        rooms = unseen_rooms()
+        rooms, views, size = unseen_rooms(), unseen.views, unseen.size
         masks = training_mixture(views, size, size, generator=torch.Generator().manual_seed(0), in_order=True)
         losses = [conditional_validation_loss(model, each, masks, seed=number) for number, each in enumerate(rooms)]
         room, known = rooms[0], max(1, views // 2)
@@ -76,16 +88,14 @@ def room_sheet(
     return draw
 
 
-def reconstruction_sheet(config: VAEConfig, *, family: str, views: int, size: int, device: torch.device) -> OnSheet:
+def reconstruction_sheet(config: VAEConfig, unseen: UnseenRooms, *, device: torch.device) -> OnSheet:
     """Sheets of an autoencoder: an unseen room's views (or the directions of their rays) before and after;
     ``mean_error`` is over them.
     """
 
     def draw(path: Path, state: dict[str, Tensor]) -> dict[str, float]:
-        from fb_core.evaluation.completion import unseen_room
-
         network = _with_weights(VAE(config), state, device)
-        room = unseen_room(family=family, seed=0, number=0, views=views, size=size)
+        room = unseen.room(0)
         is_image = config.in_channels == 3
         values = (
             room.images if is_image else to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))

@@ -101,7 +101,7 @@ class _Cell:
         return encode_null(known, **vaes, pixels=(height, width)), known
 
     def denoise_plain(self, null: Conditioning, known: Conditioning, steps: int | None = None) -> Tensor:
-        return plain_integrate(self.model.dit, self.noise, self._grid(steps), null, known, self.text, _scale(known))
+        return plain_integrate(self.model.dit, self.noise, self._grid(steps), (null, known), self.text, _scale(known))
 
     def denoise(self, null: Conditioning, known: Conditioning, steps: int | None = None) -> Tensor:
         scale, times = _scale(known), self._grid(steps)
@@ -243,7 +243,7 @@ def _saving_rows(cell: _Cell, runs: int) -> list[dict[str, Any]]:
     channels = torch.stack([null.channels, known.channels])
     prepared = Prepared(dit, channels, cell.times[:-1], text=cell.text)
     variants = {
-        "three passes": lambda: plain_step(dit, cell.noise, now, null, known, cell.text, scale),
+        "three passes": lambda: plain_step(dit, cell.noise, now, (null, known), cell.text, scale),
         "no third pass for equal text": lambda: guided(one_by_one, scale)(cell.noise, now),
         "branches in one batch": lambda: guided(evaluated_by(network, [null, known]), scale)(cell.noise, now),
         "constants computed once": lambda: guided(prepared, scale)(cell.noise, now),
@@ -296,7 +296,7 @@ def _full_size_row(cell: _Cell, runs: int) -> dict[str, Any]:
     channels = torch.stack([null.channels, known.channels])
     prepared = Prepared(dit, channels, cell.times[:-1], text=cell.text)
     jobs = {
-        "plain": lambda: plain_step(dit, cell.noise, now, null, known, cell.text, scale),
+        "plain": lambda: plain_step(dit, cell.noise, now, (null, known), cell.text, scale),
         "ours": lambda: guided(prepared, scale)(cell.noise, now),
         "preparation": lambda: Prepared(dit, channels, cell.times[:-1], text=cell.text),
     }

@@ -52,17 +52,20 @@ def plain_step(
     dit: DiT,
     state: Float[Tensor, "n 32 h w"],
     time: float,
-    null: Conditioning,
-    conditional: Conditioning,
+    conditionings: tuple[Conditioning, Conditioning],
     text: Float[Tensor, "1 words t"] | None,
     scale: Float[Tensor, "n 32 h w"],
     text_scale: float = 10.0,
 ) -> Float[Tensor, "n 32 h w"]:
-    """The guided velocity from three passes: nothing known, known, known with the (here equal) text."""
+    """The guided velocity from three passes: nothing known, known, known with the (here equal) text.
+
+    ``conditionings`` are those of `plain_conditionings`.
+    """
 
     def velocity(conditioning: Conditioning) -> Tensor:
         return dit(join(state, conditioning)[None], torch.tensor([time], device=state.device), text)[0].float()
 
+    null, conditional = conditionings
     unconditional, known, prompted = velocity(null), velocity(conditional), velocity(conditional)
     guided = unconditional + scale * (known - unconditional)
     guided[:, :LATENT_CHANNELS] += text_scale * (prompted - known)[:, :LATENT_CHANNELS]
@@ -73,14 +76,13 @@ def plain_integrate(
     dit: DiT,
     noise: Float[Tensor, "n 32 h w"],
     times: list[float],
-    null: Conditioning,
-    conditional: Conditioning,
+    conditionings: tuple[Conditioning, Conditioning],
     text: Float[Tensor, "1 words t"] | None,
     scale: Float[Tensor, "n 32 h w"],
 ) -> Float[Tensor, "n 32 h w"]:
     """Euler steps along `times`."""
     state = noise
     for index in range(len(times) - 1):
-        slope = plain_step(dit, state, times[index], null, conditional, text, scale)
+        slope = plain_step(dit, state, times[index], conditionings, text, scale)
         state = state + (times[index + 1] - times[index]) * slope
     return state

@@ -27,7 +27,9 @@ from method_configs.benchmarks.methods import Methods
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
+from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.train_options import TrainOptions
+from method_configs.commands.typed_options import TypedCompleteOptions, TypedTrainOptions, looked_at
 from method_configs.evaluations.ablations import Ablations
 from method_configs.evaluations.conditioning import Conditioning
 from method_configs.evaluations.consistency import Consistency
@@ -74,7 +76,7 @@ def train(
     /,
     *,
     output: Path,
-    training: tyro.conf.OmitArgPrefixes[TrainOptions] = TrainOptions(),
+    training: tyro.conf.OmitArgPrefixes[TypedTrainOptions] = TypedTrainOptions(),
 ) -> None:
     """Train a model; the same command again goes on where the last one ended. Under torchrun on many devices.
 
@@ -83,9 +85,10 @@ def train(
         output: Folder of the training; the finished model is its subfolder "model".
         training: What is asked for instead of what the preset says.
     """
+    options = looked_at(training, TrainOptions)
     from method_configs.commands.training import train_preset
 
-    train_preset(preset, output, training)
+    train_preset(preset, output, options)
 
 
 def convert(
@@ -121,29 +124,7 @@ def complete(
     /,
     *,
     output: Path,
-    cameras: Literal["auto", "model", "features"] = "auto",
-    path: str = "ellipse",
-    views: int = 32,
-    photos: int = 16,
-    poses_only: bool = False,
-    known_poses: Path | None = None,
-    model: Path | None = None,
-    seed: int = 0,
-    size: int | None = None,
-    steps: int | None = None,
-    sequence: int = 48,
-    prompt: str | None = None,
-    text_encoder: Path | None = None,
-    device: str | None = None,
-    precision: Literal["auto", "float32", "bfloat16"] = "auto",
-    fps: float = 8.0,
-    check: bool = True,
-    frames: Literal["scene", "model"] = "scene",
-    minutes: float = 5.0,
-    film_size: int | None = None,
-    photo_size: int | None = None,
-    iterations: int | None = None,
-    generate: bool = True,
+    scene: tyro.conf.OmitArgPrefixes[TypedCompleteOptions] = TypedCompleteOptions(),
     overwrite: bool = False,
 ) -> None:
     """Complete a scene from photos alone: cameras, splats, views of what no photo shows; leaves a film, and a capture
@@ -153,62 +134,12 @@ def complete(
         source: Folder of photos, film, or posed capture (whose cameras are then known).
         output: New folder: capture, splats.ply, fly-through.mp4, trust.mp4, sheet.png, cameras.png, raymaps,
             report.json.
-        cameras: What finds cameras: the model's raymaps, features, or the model and, where it is not sure, features.
-        path: ellipse (fitted to the cameras), orbit, spiral, or a camera path's JSON file in the world of the capture.
-        views: Pictures of the film along the path.
-        photos: Photos that new views are conditioned on, chosen by coverage; all photos get cameras.
-        poses_only: Find cameras and generate nothing.
-        known_poses: Capture that knows the cameras of some of the photos, by their file names.
-        model: Model folder; by default the bundled one.
-        seed: Decides all that is drawn.
-        size: Side of new views in pixels; by default the model's.
-        steps: Denoising steps; by default the model's recommendation.
-        sequence: With --frames model, most views, photos and new ones together, that the model sees at once; more come
-            in further passes.
-        prompt: What is to be seen, for models that read text.
-        text_encoder: Folder with the CLIP text model, which prompts need.
-        device: Where to compute, e.g. cpu or cuda:1; by default a GPU if there is one.
-        precision: Of the model's matrix products (auto: bfloat16 where the machine is faster at it).
-        fps: Pictures per second of the film.
-        check: With --frames model, look for the cameras of photos and new views once more, and report how far they are
-            off.
-        frames: scene: the film shows splats of the photos, with new views where no photo shows anything; model: the
-            model's own pictures of the path (the paper).
-        minutes: Time that a scene may take, about; it decides the sizes and steps that are not given.
-        film_size: Longest side of the scene's film in pixels, at most that of the photos.
-        photo_size: Longest side of the photos that splats are trained on.
-        iterations: Training steps of the splats.
-        generate: Let the model make up what no photo shows; without, the scene shows what photos do.
+        scene: How cameras are found, and what the film shows.
         overwrite: Replace an earlier output there.
     """
+    options = looked_at(scene, CompleteOptions)
     from method_configs.commands.complete.command import complete_scene
-    from method_configs.commands.complete.options import CompleteOptions
 
-    options = CompleteOptions(
-        cameras=cameras,
-        path=path,
-        views=views,
-        photos=photos,
-        poses_only=poses_only,
-        known_poses=known_poses,
-        model=model,
-        seed=seed,
-        size=size,
-        steps=steps,
-        sequence=sequence,
-        prompt=prompt,
-        text_encoder=text_encoder,
-        device=device,
-        precision=precision,
-        fps=fps,
-        check=check,
-        frames=frames,
-        minutes=minutes,
-        film_size=film_size,
-        photo_size=photo_size,
-        iterations=iterations,
-        generate=generate,
-    )
     complete_scene(source, output, options, overwrite=overwrite)
 
 

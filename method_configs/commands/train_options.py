@@ -50,11 +50,7 @@ class TrainOptions:
     start_from: Path | None = None
     """Model folder whose weights the training begins with; its autoencoders are kept as they are."""
 
-    def require_sensible(self) -> None:
-        """Raises ValueError, in one sentence, for numbers that make no sense.
-
-        Not while the options are made: the reader of command lines would put its own words around the sentence.
-        """
+    def __post_init__(self) -> None:
         for name in ("steps", "minutes", "accumulate", "keep"):
             value = getattr(self, name)
             if value is not None and not value > 0:

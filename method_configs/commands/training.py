@@ -72,10 +72,8 @@ def train_preset(preset: str, output: Path, options: TrainOptions = TrainOptions
     latents of finished autoencoders. Under torchrun all its processes train together. With ``options.start_from`` the
     autoencoders of that model are kept unless a stage of theirs is named.
 
-    Raises ValueError for an unknown preset or device, and for steps or minutes that are not positive. SystemExit when a
-    signal ended it, after a checkpoint.
+    Raises ValueError for an unknown preset or device. SystemExit when a signal ended it, after a checkpoint.
     """
-    options.require_sensible()
     recipe = dataclasses.replace(_recipe(preset), data=options.data, start_from=options.start_from)
     engine = dataclasses.replace(recipe.engine, **options.engine_changes)
     stages = STAGES if options.stage == "all" else (options.stage,)

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 
 from fb_core.data.meshes.mesh_pictures import Lighting, draw_with_caster, read_mesh
-from fb_core.data.training.sequences import Encode, Rendered, ViewPool
+from fb_core.data.training.sequences import Encode, PoolSize, Rendered, ViewPool
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 from fb_core.sampling.randomness import generator_of
@@ -60,15 +60,13 @@ class MeshPool(ViewPool):
         encode: Encode | None = None,
         with_images: bool = True,
     ):
-        super().__init__(
-            config.meshes,
-            config.views,
-            config.image_size,
-            config.renewed_per_step,
-            device=device,
-            encode=encode,
-            with_images=with_images,
+        size = PoolSize(
+            scenes=config.meshes,
+            views=config.views,
+            image_size=config.image_size,
+            renewed_per_step=config.renewed_per_step,
         )
+        super().__init__(size, device=device, encode=encode, with_images=with_images)
         self.files, self.config, self.seed = tuple(files), config, seed
         if not files:
             raise ValueError("meshes: expected at least one file, got none")

@@ -35,6 +35,28 @@ class Resolution:
     """Captioned pictures in a row of the batch."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What a training wants of its data, at every size."""
+
+    data: TrainingData
+    """Where they lie."""
+    pool: PoolConfig
+    """Which rooms are rendered."""
+    single_share: float = 0.0
+    """Share of the steps that are of captioned pictures."""
+    seed: int
+    """Decides every draw."""
+    device: torch.device | str = "cpu"
+    """Where data are made."""
+    encode: Encode | None = None
+    """The frozen image autoencoder, where latents of rendered views are kept."""
+
+    def multi_view(self) -> Source:
+        """The multi-view data (:func:`multi_view_source`)."""
+        return multi_view_source(self.data, self.pool, seed=self.seed, device=self.device, encode=self.encode)
+
+
 def multi_view_source(
     data: TrainingData,
     pool: PoolConfig,
@@ -60,30 +82,22 @@ def multi_view_source(
     return sources[0] if len(sources) == 1 else AnyOf(sources)
 
 
-def training_source(
-    data: TrainingData,
-    pool: PoolConfig,
-    *,
-    single_share: float,
-    per_row: int,
-    seed: int,
-    device: torch.device | str = "cpu",
-    encode: Encode | None = None,
-) -> Source:
-    """Multi-view data, with steps of captioned pictures among them where there are some and the recipe wants them."""
-    source = multi_view_source(data, pool, seed=seed, device=device, encode=encode)
+def training_source(wanted: Wanted, *, per_row: int) -> Source:
+    """Multi-view data, with steps of captioned pictures among them where there are some and the recipe wants them, so
+    many in a row of the batch.
+    """
+    source, single_share = wanted.multi_view(), wanted.single_share
     if not single_share:
         return source
-    if data.images is None:
+    if wanted.data.images is None:
         _logger.warning(
             "no captioned pictures were named: every step is multi-view (the recipe wants %g %% of them single)",
             100 * single_share,
         )
         return source
-    config = CaptionedConfig(image_size=pool.image_size, per_row=per_row)
-    return Alternating(
-        source, CaptionedImages(data.images, config, seed=seed, device=device), single_share=single_share
-    )
+    config = CaptionedConfig(image_size=wanted.pool.image_size, per_row=per_row)
+    pictures = CaptionedImages(wanted.data.images, config, seed=wanted.seed, device=wanted.device)
+    return Alternating(source, pictures, single_share=single_share)
 
 
 def resolution_of(resolutions: tuple[Resolution, ...], *, seed: int, step: int) -> Resolution:
@@ -95,55 +109,32 @@ def resolution_of(resolutions: tuple[Resolution, ...], *, seed: int, step: int) 
     return resolutions[turn(len(resolutions), seed=mixed(seed, _SOURCES), step=step)[0]]
 
 
-def at_resolutions(
-    first: Source,
-    resolutions: tuple[Resolution, ...],
-    from_step: int,
-    data: TrainingData,
-    pool: PoolConfig,
-    *,
-    single_share: float,
-    seed: int,
-    device: torch.device | str = "cpu",
-    encode: Encode | None = None,
-) -> Source:
+def at_resolutions(first: Source, resolutions: tuple[Resolution, ...], wanted: Wanted, *, from_step: int) -> Source:
     """``first`` until a step, from then on the same data at the resolution of each step (:func:`resolution_of`)."""
-    shared = {"single_share": single_share, "seed": seed, "device": device, "encode": encode}
     sources = [
-        _at_resolution(one, data, pool, among=len(resolutions), number=number, **shared)  # type: ignore[arg-type]
-        for number, one in enumerate(resolutions)
+        _at_resolution(one, wanted, among=len(resolutions), number=number) for number, one in enumerate(resolutions)
     ]
-    then = InTurn(sources, views=[one.views for one in resolutions], seed=mixed(seed, _SOURCES))
+    then = InTurn(sources, views=[one.views for one in resolutions], seed=mixed(wanted.seed, _SOURCES))
     return Later(first, then, from_step=from_step)
 
 
-def _at_resolution(
-    resolution: Resolution,
-    data: TrainingData,
-    pool: PoolConfig,
-    *,
-    among: int,
-    number: int,
-    single_share: float,
-    seed: int,
-    device: torch.device | str,
-    encode: Encode | None,
-) -> Source:
+def _at_resolution(resolution: Resolution, wanted: Wanted, *, among: int, number: int) -> Source:
     """The data at one of ``among`` resolutions; pools of all together hold as many pixels as the one that they
     follow.
     """
+    pool = wanted.pool
     smaller = max(8, round(pool.rooms * (pool.image_size / resolution.image_size) ** 2 / among))
     size, rooms = resolution.image_size, min(pool.rooms, smaller)
     pool = dataclasses.replace(pool, image_size=size, rooms=rooms, views=max(pool.views, resolution.views))
-    then = multi_view_source(data, pool, seed=seed, device=device, encode=encode)
+    then = dataclasses.replace(wanted, pool=pool).multi_view()
     if resolution.sequences > 1:
         then = SeveralPerRow(then, resolution.sequences)
-    if single_share and data.images is not None:
+    if wanted.single_share and wanted.data.images is not None:
         single = CaptionedImages(
-            data.images,
+            wanted.data.images,
             CaptionedConfig(image_size=size, per_row=resolution.images),
-            seed=mixed(seed, _SOURCES, number),
-            device=device,
+            seed=mixed(wanted.seed, _SOURCES, number),
+            device=wanted.device,
         )
-        then = Alternating(then, single, single_share=single_share)
+        then = Alternating(then, single, single_share=wanted.single_share)
     return then

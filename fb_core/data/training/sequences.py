@@ -70,15 +70,26 @@ class Rendered(NamedTuple):
     """How far along each pixel's ray that is, in scene units, where the pool knows it."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PoolSize:
+    """How much a pool holds."""
+
+    scenes: int
+    """At hand."""
+    views: int
+    """Of each scene."""
+    image_size: int
+    """Side of the square views in pixels."""
+    renewed_per_step: float
+    """Scenes replaced per training step."""
+
+
 class ViewPool(ABC):
     """Rendered scenes of some square views each, renewed step by step."""
 
     def __init__(
         self,
-        scenes: int,
-        views: int,
-        image_size: int,
-        renewed_per_step: float,
+        size: PoolSize,
         *,
         device: torch.device | str = "cpu",
         encode: Encode | None = None,
@@ -91,7 +102,8 @@ class ViewPool(ABC):
         Without images (black ones stand in) nothing is rendered: enough for the raymap autoencoder. ``with_distance``
         is for pools that give the distances of what is seen.
         """
-        self.scenes, self.views, self.image_size, self.renewed_per_step = scenes, views, image_size, renewed_per_step
+        self.scenes, self.views, self.image_size = scenes, views, image_size = size.scenes, size.views, size.image_size
+        self.renewed_per_step = size.renewed_per_step
         self.with_images, self.device, self._encode = with_images, torch.device(device), encode
         self._latents: list[Tensor | None] = [None] * scenes
         self._images = torch.zeros((scenes, views, 3, image_size, image_size), dtype=torch.uint8, device=self.device)
@@ -218,10 +230,13 @@ class RoomPool(ViewPool):
         encode: Encode | None = None,
         with_images: bool = True,
     ):
-        super().__init__(
-            config.rooms, config.views, config.image_size, config.renewed_per_step, device=device, encode=encode,
-            with_images=with_images, with_distance=encode is not None,
-        )  # fmt: skip
+        size = PoolSize(
+            scenes=config.rooms,
+            views=config.views,
+            image_size=config.image_size,
+            renewed_per_step=config.renewed_per_step,
+        )
+        super().__init__(size, device=device, encode=encode, with_images=with_images, with_distance=encode is not None)
         self.config, self.seed = config, seed
 
     def render(self, numbers: list[int]) -> list[Rendered]:

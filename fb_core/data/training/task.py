@@ -167,7 +167,7 @@ def draw_task(
     With mixture "shares" the first view, the frame's reference, is known or partly known, as in inference.
     """
     if task.mixture == "quarters":
-        masks = training_mixture(count, size, size, generator=generator, device=device)
+        masks = training_mixture(count, size, size, generator=generator).to(device)
     else:
         masks = _by_shares(count, size, task, generator, device)
     everything = torch.ones_like(masks)

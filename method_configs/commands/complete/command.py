@@ -38,8 +38,9 @@ from fb_core.machine.clock import Clock
 from fb_core.machine.devices import chosen_device
 from fb_core.machine.resources import peak_memory_bytes
 from method_configs.commands.complete.forecast import forecast
-from method_configs.commands.complete.options import CHECKED, CompleteOptions, Plan, pose_sampling
+from method_configs.commands.complete.options import CHECKED, CompleteOptions
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
+from method_configs.commands.complete.plan import Plan, pose_sampling
 from method_configs.commands.complete.report import announcement, no_cameras, report_of, what_was_found
 
 _WORKING = {
@@ -130,7 +131,7 @@ def _work_of_scene(
     job: Job, options: CompleteOptions, output: Path, model: Fillerbuster | None
 ) -> AbstractContextManager[Path]:
     """Where the work is kept."""
-    from method_configs.commands.complete.scene_work import question_of, work_beside
+    from method_configs.commands.complete.scenes.scene_work import question_of, work_beside
 
     return work_beside(output, question_of(job.photos, options, None if model is None else model.model_hash))
 
@@ -345,8 +346,8 @@ def _work_on_scene(
     job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock, work: Path
 ) -> tuple[FoundCameras, NewViews | None, dict[str, Any]]:
     """Cameras, splats, new views where they are needed, a film; what an earlier try has kept is not done again."""
-    from method_configs.commands.complete.scene import SceneJob, complete_with_splats
-    from method_configs.commands.complete.scene_work import keep_cameras, kept_cameras
+    from method_configs.commands.complete.scenes.scene import SceneJob, complete_with_splats
+    from method_configs.commands.complete.scenes.scene_work import keep_cameras, kept_cameras
 
     began = time.perf_counter()
     found = kept_cameras(work, job.photos)

@@ -12,7 +12,8 @@ from fb_core.data.photos.photo import Photo
 from fb_core.geometry.features.pairs import FEATURES, pairs_at_most
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.registration.by_features import LONGEST_SIDE
-from method_configs.commands.complete.options import CHECKED, POSES_AT_ONCE, CompleteOptions, Plan
+from method_configs.commands.complete.options import CHECKED, POSES_AT_ONCE, CompleteOptions
+from method_configs.commands.complete.plan import Plan
 
 # What takes as long as so many products of numbers, measured on one core (docs/speed_and_accuracy.md, "From photos
 # alone").

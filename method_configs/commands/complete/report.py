@@ -18,8 +18,9 @@ from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.memory.budget import GIB, bound
 from fb_core.registration.choice import Registration
 from method_configs.commands.complete.forecast import Forecast
-from method_configs.commands.complete.options import POSES_AT_ONCE, CompleteOptions, Plan
+from method_configs.commands.complete.options import POSES_AT_ONCE, CompleteOptions
 from method_configs.commands.complete.output import COMMAND
+from method_configs.commands.complete.plan import Plan
 
 _MOST_NAMED = 5  # photos that are left out, on the screen
 _METHODS = {"known": "given", "model": "by the model", "features": "by features"}

@@ -365,7 +365,7 @@ def test_options_beyond_all_use(name: str):
 def test_training_steps_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     from method_configs.commands.command_line import main
 
-    assert "steps: expected" in refused(lambda: TrainOptions(steps=10**15).require_sensible())
+    assert "steps: expected" in refused(lambda: TrainOptions(steps=10**15))
     with pytest.raises(SystemExit) as ended:
         main(["train", "rooms-tiny", "--output", str(tmp_path / "out"), "--steps", str(10**15)])
     assert ended.value.code == 1 and "Error: steps: expected" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from fb_core.geometry.viewpoints.coverage import Coverage
 from fb_core.geometry.viewpoints.paths import CaptureShape
 from fb_nerfstudio.splats.scene_film import film_frame, seen_by_photos
 from fb_nerfstudio.splats.splat_file import Splats, read_splats, write_splats
-from method_configs.commands.complete.scene_budget import SceneBudget, Speed
+from method_configs.commands.complete.scenes.scene_budget import SceneBudget, Speed
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

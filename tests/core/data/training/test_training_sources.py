@@ -32,7 +32,7 @@ from fb_core.data.training.capture_sequences import (
     read_training_capture,
     strided,
 )
-from fb_core.data.training.folders import Resolution, at_resolutions, multi_view_source, resolution_of
+from fb_core.data.training.folders import Resolution, Wanted, at_resolutions, multi_view_source, resolution_of
 from fb_core.data.training.mixed_sources import Alternating, AnyOf, Later, SeveralPerRow
 from fb_core.data.training.named_data import TrainingData
 from fb_core.data.training.sequences import PoolConfig, RoomPool
@@ -421,7 +421,8 @@ def resolved_source(shards=None) -> Source:
     data = TrainingData(images=None if shards is None else str(shards))
     share = 0.0 if shards is None else 0.5
     first = multi_view_source(data, pool, seed=3)
-    return at_resolutions(first, RESOLUTIONS, 2, data, pool, single_share=share, seed=3)
+    wanted = Wanted(data=data, pool=pool, single_share=share, seed=3)
+    return at_resolutions(first, RESOLUTIONS, wanted, from_step=2)
 
 
 @pytest.mark.parametrize("singles", [False, True])

@@ -12,7 +12,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.scene_film import film_frame
 from fb_nerfstudio.splats.splat_file import Splats
-from method_configs.commands.complete.scene_training import SceneSchedule
+from method_configs.commands.complete.scenes.scene_training import SceneSchedule
 
 _COMPLETE_AT = 500  # as ns-train fillerbuster
 FEWEST_STEPS, MOST_STEPS = 300, 7000

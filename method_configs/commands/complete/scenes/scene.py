@@ -44,8 +44,8 @@ from fb_nerfstudio.splats.scene_film import FilmFrame, film_frame, seen_by_photo
 from fb_nerfstudio.splats.splat_file import Splats, read_splats, write_splats
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.output import FilmFiles, NewViews
-from method_configs.commands.complete.scene_budget import SceneBudget, Speed, measured_speed
-from method_configs.commands.complete.scene_training import train_scene
+from method_configs.commands.complete.scenes.scene_budget import SceneBudget, Speed, measured_speed
+from method_configs.commands.complete.scenes.scene_training import train_scene
 
 _FEATURES_SIDE = 960  # of photos in which features are sought for the first Gaussians
 _GENERATED_SHARE = 0.3  # as ns-train fillerbuster
