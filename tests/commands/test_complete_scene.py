@@ -30,18 +30,10 @@ from fb_core.registration.choice import Registration
 from fb_nerfstudio.splats.backend import BLUR, render_splats
 from fb_nerfstudio.splats.splat_file import Splats, read_splats
 from method_configs.commands import command_line as commands
-from method_configs.commands.complete import (
-    command as complete_command,
-)
-from method_configs.commands.complete import (
-    output as complete_output,
-)
-from method_configs.commands.complete import (
-    scene as complete_scene,
-)
-from method_configs.commands.complete import (
-    scene_work,
-)
+from method_configs.commands.complete import command as complete_command
+from method_configs.commands.complete import output as complete_output
+from method_configs.commands.complete.scenes import scene as complete_scene
+from method_configs.commands.complete.scenes import scene_work
 
 QUICK = ("--views", 3, "--steps", 1, "--iterations", 4, "--photo-size", 32, "--film-size", 32)
 
