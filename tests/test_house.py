@@ -17,7 +17,7 @@ LONG_FILES = {
     "method_configs/commands/complete/scene.py",
 }
 TALL_FUNCTIONS = 3
-MANY_ARGUMENTS = 24
+MANY_ARGUMENTS = 20
 
 
 @pytest.fixture(name="counts", scope="module")
