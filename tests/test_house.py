@@ -11,12 +11,10 @@ from house_counts import Counts
 
 # Not yet within the bounds; names may only leave these lists.
 LONG_FILES = {
-    "fb_core/completion/planning/plan.py",
-    "fb_core/data/capture/captures.py",
     "method_configs/commands/complete/command.py",
     "method_configs/commands/complete/scene.py",
 }
-TALL_FUNCTIONS = 3
+TALL_FUNCTIONS = 1
 MANY_ARGUMENTS = 20
 
 

@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
-from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, round_seed, shell_of, thinned_points
+from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, round_seed
+from fb_core.completion.planning.site import shell_of, thinned_points
 from fb_core.completion.results.completed_views import INPAINTED, CompletedViews, Origin
 from fb_core.completion.rounds import (
     CapturedView,

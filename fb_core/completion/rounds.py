@@ -129,23 +129,28 @@ def run_completion(
         guess = None if ignored or first_guess is None else first_guess(planned.cameras)
         current = None if guess is None else Views.cat([*known, guess])
         images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
-        origin = Origin(
-            role=planned.role,
-            round=planned.number,
-            seed=planned.seed,
-            prompt=planned.prompt,
-            model_hash=model.model_hash,
-            aspect=planned.aspect,
-        )
-        views = CompletedViews(
-            images=images,
-            masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),
-            cameras=planned.cameras,
-            origins=(origin,) * len(planned.cameras),
-        )
+        views = _completed(planned, images, model.model_hash)
         if planned.role == ANCHOR:
             anchors = _as_views(views)
         yield views
+
+
+def _completed(planned: PlannedRound, images: UInt8[Tensor, "n h w 3"], model_hash: str) -> CompletedViews:
+    """The views of a round, with where they came from; margins beside its aspect are not trained on."""
+    origin = Origin(
+        role=planned.role,
+        round=planned.number,
+        seed=planned.seed,
+        prompt=planned.prompt,
+        model_hash=model_hash,
+        aspect=planned.aspect,
+    )
+    return CompletedViews(
+        images=images,
+        masks=_shown(planned.aspect, images.shape[1]).expand(len(images), -1, -1, -1).contiguous(),
+        cameras=planned.cameras,
+        origins=(origin,) * len(planned.cameras),
+    )
 
 
 def open_cache(config: CompletionConfig) -> CompletionCache | None:
