@@ -189,7 +189,7 @@ def load(
     folder = Path(folder)
     config, info = read_config(folder)
     if dtype is not None:
-        _require_precision(torch.device(device), dtype)
+        require_precision(torch.device(device), dtype)
     dit = without_weights(lambda: DiT(config.transformer))
     image_vae = without_weights(lambda: VAE(config.image_vae))
     raymap_vae = without_weights(lambda: VAE(config.raymap_vae))
@@ -289,7 +289,8 @@ def _load_weights(module: nn.Module, path: Path, device: torch.device | str, dty
         adopt(str(path), module, {name: file.get_tensor(name).to(dtype=dtype) for name in names})
 
 
-def _require_precision(device: torch.device, dtype: torch.dtype) -> None:
+def require_precision(device: torch.device, dtype: torch.dtype) -> None:
+    """Raises ValueError for a type that is no floating-point type, or that the device does not compute in."""
     if not dtype.is_floating_point:
         raise ValueError(f"dtype: expected a floating point type, got {dtype}.")
     if device.type == "cpu" and dtype == torch.float16:

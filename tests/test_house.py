@@ -9,15 +9,9 @@ import house_counts
 import pytest
 from house_counts import Counts
 
-# Not yet within the bounds; names may only leave these lists.
-LONG_FILES = {
-    "fb_core/completion/planning/plan.py",
-    "fb_core/data/capture/captures.py",
-    "method_configs/commands/complete/command.py",
-    "method_configs/commands/complete/scenes/scene.py",
-}
-TALL_FUNCTIONS = 3
-MANY_ARGUMENTS = 24
+# Not yet within the bounds; these may only go down.
+TALL_FUNCTIONS = 1
+MANY_ARGUMENTS = 18
 
 
 @pytest.fixture(name="counts", scope="module")
@@ -35,7 +29,7 @@ def test_folders_hold_twelve_files_at_most(counts: Counts):
 
 
 def test_files_are_of_a_size_to_read(counts: Counts):
-    assert {name for name, lines in counts.lines_per_file.items() if lines > 400} <= LONG_FILES
+    assert {name for name, lines in counts.lines_per_file.items() if lines > 400} == set()
     assert 60 <= statistics.median(lines for lines in counts.lines_per_file.values() if lines) <= 160
 
 

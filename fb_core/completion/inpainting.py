@@ -17,17 +17,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
-from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, round_seed, shell_of, thinned_points
+from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, round_seed
+from fb_core.completion.planning.site import shell_of, thinned_points
 from fb_core.completion.results.completed_views import INPAINTED, CompletedViews, Origin
 from fb_core.completion.rounds import (
     CapturedView,
     Inpainter,
+    Named,
+    RoundMaker,
     expectation,
     fitted_rectangle,
     fitted_view,
     model_name,
     open_cache,
-    round_images,
 )
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
@@ -103,7 +105,8 @@ def run_inpainting(
         )
         fitted.append(fitted_view(dataclasses.replace(view, known=given), plan.size))
     _refuse_nothing_to_do(told)
-    squares = round_images(Views.cat(fitted), planned, model, config, open_cache(config), on_step, on_found)
+    maker = RoundMaker(model=model, config=config, cache=open_cache(config), on_step=on_step, on_found=on_found)
+    squares = maker.images(Views.cat(fitted), planned)
     origin = Origin(
         role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash
     )
@@ -152,7 +155,11 @@ def announcement_of_inpainting(plan: CompletionPlan, config: CompletionConfig, m
         else f" (asked for {config.masked.views}; the capture has no more)"
     )
     sampling = config.sampling(model.recommended_sampling)
-    how = "without diffusion" if getattr(model, "weight_free", False) else f"in one pass of {sampling.steps} steps"
+    how = (
+        "without diffusion"
+        if isinstance(model, Named) and model.weight_free
+        else f"in one pass of {sampling.steps} steps"
+    )
     windows = "" if sampling.window is None else f" in windows of {sampling.window} views"
     rim = f", holes grown by {config.masked.dilate} pixels" if config.masked.dilate else ""
     return (

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -71,6 +71,27 @@ class Inpainter(Protocol):
         ...
 
 
+@runtime_checkable
+class Forecasting(Protocol):
+    """An inpainter that knows beforehand what its work will take."""
+
+    def expected(
+        self, *, views: int, known: int, size: int, sampling: SamplingConfig, prompted: bool = False
+    ) -> tuple[float, int]:
+        """Seconds, about, and bytes, at most, that completing square views takes, so many of them known."""
+        ...
+
+
+@runtime_checkable
+class Named(Protocol):
+    """An inpainter that is no model of ours, and says what it is."""
+
+    name: str
+    """What a person calls it."""
+    weight_free: bool
+    """Whether it imagines nothing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CapturedView:
     """One captured picture with its camera, as far as it is known."""
@@ -113,7 +134,7 @@ def run_completion(
 
     Raises ValueError when the cache's folder is a file, and as the model does.
     """
-    cache = open_cache(config)
+    maker = RoundMaker(model=model, config=config, cache=open_cache(config), on_step=on_step, on_found=on_found)
     fitted = Views.cat([fitted_view(view, plan.size) for view in context])
     finished = [] if done is None else done.rounds
     anchors = (
@@ -128,24 +149,29 @@ def run_completion(
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
         guess = None if ignored or first_guess is None else first_guess(planned.cameras)
         current = None if guess is None else Views.cat([*known, guess])
-        images = round_images(sequence, planned, model, config, cache, on_step, on_found, current)
-        origin = Origin(
-            role=planned.role,
-            round=planned.number,
-            seed=planned.seed,
-            prompt=planned.prompt,
-            model_hash=model.model_hash,
-            aspect=planned.aspect,
-        )
-        views = CompletedViews(
-            images=images,
-            masks=_shown(planned.aspect, plan.size).expand(len(images), -1, -1, -1).contiguous(),
-            cameras=planned.cameras,
-            origins=(origin,) * len(planned.cameras),
-        )
+        images = maker.images(sequence, planned, current)
+        views = _completed(planned, images, model.model_hash)
         if planned.role == ANCHOR:
             anchors = _as_views(views)
         yield views
+
+
+def _completed(planned: PlannedRound, images: UInt8[Tensor, "n h w 3"], model_hash: str) -> CompletedViews:
+    """The views of a round, with where they came from; margins beside its aspect are not trained on."""
+    origin = Origin(
+        role=planned.role,
+        round=planned.number,
+        seed=planned.seed,
+        prompt=planned.prompt,
+        model_hash=model_hash,
+        aspect=planned.aspect,
+    )
+    return CompletedViews(
+        images=images,
+        masks=_shown(planned.aspect, images.shape[1]).expand(len(images), -1, -1, -1).contiguous(),
+        cameras=planned.cameras,
+        origins=(origin,) * len(planned.cameras),
+    )
 
 
 def open_cache(config: CompletionConfig) -> CompletionCache | None:
@@ -153,47 +179,52 @@ def open_cache(config: CompletionConfig) -> CompletionCache | None:
     return None if config.cache_dir is None else CompletionCache(config.cache_dir)
 
 
-def round_images(
-    sequence: Views,
-    planned: PlannedRound,
-    model: Inpainter,
-    config: CompletionConfig,
-    cache: CompletionCache | None,
-    on_step: Callable[[PlannedRound, int, int], None] | None,
-    on_found: Callable[[PlannedRound], None] | None,
-    current: Views | None = None,
-) -> UInt8[Tensor, "n h w 3"]:
-    """Pictures of the sequence's last views, those of the round: from the cache, or generated (from ``current``) and
-    kept there.
-    """
-    sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
-    if current is not None:
-        sampling = dataclasses.replace(sampling, strength=config.strength)
-    key = ""
-    if cache is not None:
-        key = round_key(
-            sequence, seed=planned.seed, sampling=sampling, model_hash=model.model_hash, prompt=prompt, current=current
+@dataclass(frozen=True, kw_only=True)
+class RoundMaker:
+    """Makes the pictures of rounds: by the model, or from the cache where it has them."""
+
+    model: Inpainter
+    """The diffusion model."""
+    config: CompletionConfig
+    """Sampling options."""
+    cache: CompletionCache | None
+    """Where rounds are kept; None for nowhere."""
+    on_step: Callable[[PlannedRound, int, int], None] | None = None
+    """Called with (round, denoising steps done, steps in all)."""
+    on_found: Callable[[PlannedRound], None] | None = None
+    """Called with a round that is loaded from the cache."""
+
+    def images(self, sequence: Views, planned: PlannedRound, current: Views | None = None) -> UInt8[Tensor, "n h w 3"]:
+        """Pictures of the sequence's last views, those of the round; generated from ``current`` where that is given.
+
+        Raises ValueError as the model does.
+        """
+        config, model, on_step = self.config, self.model, self.on_step
+        sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
+        if current is not None:
+            sampling = dataclasses.replace(sampling, strength=config.strength)
+        key = ""
+        if self.cache is not None:
+            asked = {"seed": planned.seed, "sampling": sampling, "model_hash": model.model_hash}
+            key = round_key(sequence, **asked, prompt=prompt, current=current)
+            kept = self.cache.find(key, views=views, size=sequence.size[0])
+            if kept is not None:
+                if self.on_found is not None:
+                    self.on_found(planned)
+                return kept
+        filled = model.complete(
+            sequence,
+            generator=torch.Generator().manual_seed(planned.seed),
+            sampling=sampling,
+            on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
+            prompt=prompt or None,
+            current=current,
         )
-    found = None if cache is None else cache.find(key, views=views, size=sequence.size[0])
-    if found is not None:
-        if on_found is not None:
-            on_found(planned)
-        return found
-    optional: dict[str, Any] = ({"prompt": prompt} if prompt else {}) | (
-        {} if current is None else {"current": current}
-    )
-    filled = model.complete(
-        sequence,
-        generator=torch.Generator().manual_seed(planned.seed),
-        sampling=sampling,
-        on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
-        **optional,
-    )
-    new = filled[list(range(len(sequence) - views, len(sequence)))]
-    images = in_8_bits(new.images)
-    if cache is not None:
-        cache.keep(key, images)
-    return images
+        new = filled[list(range(len(sequence) - views, len(sequence)))]
+        images = in_8_bits(new.images)
+        if self.cache is not None:
+            self.cache.keep(key, images)
+        return images
 
 
 def in_8_bits(images: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w 3"]:
@@ -266,12 +297,11 @@ def expectation(sequences: Sequence[tuple[int, int]], size: int, config: Complet
     """What sequences of (known, generated) views will take, as far as the model can tell; for example ``; about 40 s,
     0.6 GiB``.
     """
-    expected = getattr(model, "expected", None)
-    if expected is None or not sequences:
+    if not isinstance(model, Forecasting) or not sequences:
         return ""
     sampling, prompted = config.sampling(model.recommended_sampling), bool(config.prompt)
     each = [
-        expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted)
+        model.expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted)
         for known, generated in sequences
     ]
     seconds, most = sum(one[0] for one in each), max(one[1] for one in each)
@@ -289,7 +319,7 @@ def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:
 def model_name(config: CompletionConfig, model: Inpainter) -> str:
     """What a person calls the model."""
     own = "the bundled model" if config.model is None else f"model {Path(config.model).name}"
-    return getattr(model, "name", own)
+    return model.name if isinstance(model, Named) else own
 
 
 def _anchors(plan: CompletionPlan) -> int:

@@ -204,7 +204,7 @@ def _put_in_place(work: Path, folder: Path) -> None:
     new, old = work / _NEW, work / _OLD
     if not folder.exists() or not any(folder.iterdir()):
         os.rename(new, folder)  # which replaces an empty folder in one step
-    elif not _exchange(new, folder):
+    elif not exchange(new, folder):
         os.rename(folder, old)
         try:
             os.rename(new, folder)
@@ -213,7 +213,7 @@ def _put_in_place(work: Path, folder: Path) -> None:
             raise
 
 
-def _exchange(one: Path, other: Path) -> bool:
+def exchange(one: Path, other: Path) -> bool:
     """Let two folders change places in one step; False where the system, or this disk, has no such step."""
     function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if function is None:

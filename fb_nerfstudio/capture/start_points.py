@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
-from fb_core.completion.planning.plan import shell_of
+from fb_core.completion.planning.site import shell_of
 from fb_core.data.capture.undistort import check_lens, straight_directions
 from fb_core.data.media import fits_only_upright, read_mask, read_photo, resize
 from fb_core.geometry.cameras import Pinholes

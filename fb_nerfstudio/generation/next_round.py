@@ -13,7 +13,8 @@ import torch.nn.functional as F
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.pixel_trust import LEAST
-from fb_core.completion.planning.plan import CompletionPlan, Former
+from fb_core.completion.planning.plan import CompletionPlan
+from fb_core.completion.planning.site import Former
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.trust import Trust
 from fb_core.geometry.cameras import Pinholes

@@ -119,7 +119,7 @@ def _train_stages(training: _Training) -> bool:
 
 def _train_stage(training: _Training, name: str, *, minutes: float) -> bool:
     """Whether it was trained to its end. SystemExit when a signal ended it."""
-    with _progress(name, training.group) as show:
+    with progress_shown(name, training.group) as show:
         run = run_stage(
             training.recipe,
             name,
@@ -220,7 +220,7 @@ def _cost_in_words(stage: str, cost: Cost) -> str:
 
 
 @contextlib.contextmanager
-def _progress(stage: str, group: Group) -> Iterator[OnProgress | None]:
+def progress_shown(stage: str, group: Group) -> Iterator[OnProgress | None]:
     """A bar where a person watches, a line in the log now and then elsewhere; for the first process only."""
     if not group.is_main:
         yield None

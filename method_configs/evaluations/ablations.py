@@ -57,7 +57,7 @@ class Ablations:
 
         task = AblationTask(sequences=self.sequences, lengths=self.lengths, seed=self.seed)
         autoencoders = Fillerbuster.from_pretrained(self.model)
-        designs = _designs(self.base, self.steps)
+        designs = designs_of(self.base, self.steps)
         asked = cache(lambda: asked_sequences(task, designs["base"].pool.image_size))
         results: dict[tuple[str, int], list[dict[str, float]]] = {}
         for seed in self.seeds:
@@ -70,7 +70,10 @@ class Ablations:
         show(report, self.json, [])
 
 
-def _designs(base: str, steps: int | None) -> dict[str, Recipe]:
+def designs_of(base: str, steps: int | None) -> dict[str, Recipe]:
+    """The preset and each of its ablations, by name, perhaps with other numbers of steps. Raises ValueError for an
+    unknown preset.
+    """
     import dataclasses
 
     from method_configs.presets import PRESETS, ablations_of

@@ -105,7 +105,7 @@ class Trust(TableFiles):
 
         from fb_core.completion.options import CompletionConfig
         from fb_core.completion.pixel_trust import evidence_of
-        from fb_core.completion.planning.plan import shell_of
+        from fb_core.completion.planning.site import shell_of
         from fb_core.completion.rounds import CapturedView
         from fb_core.completion.trust import Surroundings, along_rays, measured_trust
         from fb_core.evaluation.completion import complete_hidden, unseen_room

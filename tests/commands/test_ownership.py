@@ -318,7 +318,7 @@ def test_saving_a_model_survives_that_its_second_rename_fails(tmp_path: Path, mo
 
     model, real = save_tiny_model(tmp_path / "model", seed=1), os.rename
     before = model_hash(model)
-    monkeypatch.setattr(whole, "_exchange", lambda one, other: False)
+    monkeypatch.setattr(whole, "exchange", lambda one, other: False)
 
     def fails(source, target):
         if Path(source).name == "new":

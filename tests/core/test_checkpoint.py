@@ -253,7 +253,7 @@ def test_weights_with_unknown_missing_and_misshapen_keys(folder):
 
 
 def test_beside_float16_the_autoencoders_stay_in_float32(folder, monkeypatch):
-    monkeypatch.setattr(checkpoint, "_require_precision", lambda device, dtype: None)  # as on a GPU
+    monkeypatch.setattr(checkpoint, "require_precision", lambda device, dtype: None)  # as on a GPU
     loaded = load(folder, dtype=torch.float16)
     assert loaded.dit.dtype == torch.float16
     assert loaded.image_vae.dtype == loaded.raymap_vae.dtype == torch.float32

@@ -2,7 +2,8 @@
 
 What fake tensors cannot follow and is therefore not run here: the canonical frame of known rays and the checks of input
 in `Fillerbuster.complete`, and streams of known tokens, whose sizes depend on values; memory asked of a GPU that is not
-there. Plans of a completion are made on the CPU.
+there. Plans of a completion are made on the CPU, whatever device cameras and points are on; with the answer no, no
+pose is finite, which they refuse. The splat model's forward is in `tests/plugin/splats/test_splat_device.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ import torch
 from helpers.pretended_device import DEVICE, drawn, made_there, pretended
 from helpers.tiny_models import _SMALL_VAE
 
+from fb_core.completion.options import CompletionConfig
+from fb_core.completion.planning.plan import plan_completion
 from fb_core.conditioning import Conditioning, Encoding, decode_in_chunks, encode_known, encode_null, split
+from fb_core.geometry.cameras import Pinholes
 from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import VAE, VAEConfig
 from fb_core.sampling import SamplingConfig, noise_of, random_orders
@@ -89,3 +93,17 @@ def test_splats_are_drawn_where_they_are(degree: int | None, mode: str):
             sh_degree=degree, render_mode=mode,
         )  # fmt: skip
         assert picture.device == alpha.device == DEVICE
+
+
+@pytest.mark.parametrize("anchors", [4, None], ids=["so many anchors", "what the capture needs"])
+@pytest.mark.parametrize("context", ["spread", "stride", "overlap"])
+def test_plans_are_made_on_the_cpu_wherever_cameras_and_points_are(anchors: int | None, context: str):
+    with pretended(True):
+        cameras = [
+            Pinholes(camera_to_world=drawn(1, 3, 4), focal=drawn(1, 2), principal=drawn(1, 2), width=16, height=16)
+            for _ in range(6)
+        ]
+        config = CompletionConfig(anchor_views=anchors, densify_rounds=1, context_choice=context)
+        plan = plan_completion(cameras, drawn(30, 3), config, size=16)
+        places = [plan.shape.center, plan.shell.log_radius, *(one.cameras.camera_to_world for one in plan.rounds)]
+        assert {place.device.type for place in places} == {"cpu"} and plan.context

@@ -88,7 +88,7 @@ def test_a_claim_is_reproduced_only_beyond_its_interval():
 def test_designs_are_trained_once_and_measured_once(tmp_path, monkeypatch):
     options = {"output": tmp_path / "out", "model": save_tiny_model(tmp_path / "model"), "seeds": (0,), "steps": 1}
     asked = {"sequences": 1, "lengths": (8,)}
-    monkeypatch.setattr(ablation_evaluation, "_designs", _tiny_designs)
+    monkeypatch.setattr(ablation_evaluation, "designs_of", _tiny_designs)
     Ablations(**options, **asked, json=tmp_path / "first.json").run()
     monkeypatch.setattr(side_by_side, "train_side_by_side", None)
     Ablations(**options, **asked, json=tmp_path / "again.json").run()

@@ -25,7 +25,7 @@ from fb_core.files.whole import whole_file
 from fb_core.inpainter import SamplingConfig
 from fb_core.views import Views
 
-_VERSION = 2
+VERSION = 2
 """Of the key and of the files. To be raised whenever the same inputs come to give other pictures."""
 _ONLY_HOW = ("memory_budget_bytes", "views_at_once")
 """Sampling options that cut the work without deciding what is generated."""
@@ -55,7 +55,7 @@ def round_key(
     """
     options = {name: value for name, value in dataclasses.asdict(sampling).items() if name not in _ONLY_HOW}
     told = {
-        "version": _VERSION,
+        "version": VERSION,
         "seed": seed,
         "sampling": options,
         "model": model_hash,

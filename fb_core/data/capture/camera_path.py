@@ -143,3 +143,23 @@ def _field_of_view(entry: dict[str, Any], index: int, path: Path) -> float:
             f"{_LEAST_DEGREES:g} to {_MOST_DEGREES:g} degrees"
         )
     return float(value)
+
+
+def as_camera_path(cameras: Pinholes) -> dict[str, Any]:
+    """Cameras as nerfstudio's viewer saves a path, for :func:`read_camera_path`."""
+    poses = flip_axes(cameras.camera_to_world)
+    corner = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=poses.dtype)
+    degrees = torch.rad2deg(2 * torch.atan(cameras.height / 2 / cameras.focal[:, 1]))
+    return {
+        "camera_type": "perspective",
+        "render_width": cameras.width,
+        "render_height": cameras.height,
+        "camera_path": [
+            {
+                "camera_to_world": torch.cat([pose, corner]).flatten().tolist(),
+                "fov": float(fov),
+                "aspect": cameras.width / cameras.height,
+            }
+            for pose, fov in zip(poses, degrees, strict=True)
+        ],
+    }

@@ -19,7 +19,8 @@ from fb_core.data.rooms.room import Room
 from fb_core.data.rooms.shading import surface_colours
 from fb_core.geometry.cameras import Pinholes
 
-_CPU_PAIRS, _GPU_PAIRS = 2**18, 2**25
+CPU_PAIRS, GPU_PAIRS = 2**18, 2**25
+"""Rays and solids that are tried at a time, which bounds memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,4 +171,4 @@ def _fill(planes: Float[Tensor, "7 b v r"], table: RoomTable, cameras: Pinholes,
 
 def _pairs_at_once(device: torch.device) -> int:
     """Ray-solid pairs to work on together: what fits a core's cache, or keeps a GPU busy within about 2 GB."""
-    return _CPU_PAIRS if device.type == "cpu" else _GPU_PAIRS
+    return CPU_PAIRS if device.type == "cpu" else GPU_PAIRS

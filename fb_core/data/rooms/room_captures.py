@@ -247,8 +247,8 @@ def write_room_capture(capture: RoomCapture, output: Path, *, ground_truth: bool
     with whole_folder(Target(folder=output, kind="capture")) as unfinished:
         write_capture(unfinished, [*taken, *others], points=capture.points, extra=extra)
         if ground_truth:
-            _write_ground_truth(unfinished, "captured", capture.images)
-            _write_ground_truth(unfinished, "held_out", capture.held_out_images)
+            write_ground_truth(unfinished, "captured", capture.images)
+            write_ground_truth(unfinished, "held_out", capture.held_out_images)
 
 
 def _refuse_taken(output: Path) -> None:
@@ -272,7 +272,7 @@ def _frames(
     return frames
 
 
-def _write_ground_truth(folder: Path, prefix: str, images: RoomImages) -> None:
+def write_ground_truth(folder: Path, prefix: str, images: RoomImages) -> None:
     """Depth and normals of one group as EXR files."""
     (folder / "ground_truth").mkdir(exist_ok=True)
     for index in range(len(images.rgb)):

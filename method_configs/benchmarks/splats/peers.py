@@ -8,7 +8,7 @@ loop that sorts Gaussians into tiles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,28 +22,21 @@ TILE = 16
 _CAP, _STOP = 0.999, 1e-4
 
 
-def tile_loop(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
+def tile_loop(**inputs: Any) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
     """Colours and depth, alpha (gsplat 1.4's rules): tile by tile, its Gaussians times 256 pixels, differentiated by
     autograd.
+
+    ``inputs`` are those of a scene (``SplatScene.inputs``), here and below.
     """
-    view = _projected(means, quats, scales, viewmats, Ks, width, height)
-    values, background = torch.cat([colors, view["depths"][:, None]], dim=1), means.new_zeros(5)
+    view, opacities, width, height = _projected(inputs), inputs["opacities"], inputs["width"], inputs["height"]
+    values = torch.cat([inputs["colors"], view["depths"][:, None]], dim=1)
+    background = values.new_zeros(5)
     strips = []
     for top in range(0, height, TILE):
         row = []
         for left in range(0, width, TILE):
             y, x = torch.meshgrid(torch.arange(top, top + TILE), torch.arange(left, left + TILE), indexing="ij")
-            pixels = torch.stack([x, y], dim=-1).reshape(-1, 2).to(means) + 0.5
+            pixels = torch.stack([x, y], dim=-1).reshape(-1, 2).to(values) + 0.5
             inside = (view["first"] <= torch.tensor([left, top]) // TILE) & (
                 view["last"] > torch.tensor([left, top]) // TILE
             )
@@ -56,15 +49,16 @@ def tile_loop(
     return image[..., :4], image[..., 4:]
 
 
-def _projected(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int
-) -> dict[str, Tensor]:
-    """Of one camera, by gsplat's own torch functions."""
+def _projected(inputs: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The Gaussians on the picture of one camera, by gsplat's own torch functions."""
     from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
-    covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    means, width, height = inputs["means"], inputs["width"], inputs["height"]
+    covars, _ = _quat_scale_to_covar_preci(inputs["quats"], inputs["scales"], compute_preci=False)
     assert covars is not None
-    radii, means2d, depths, conics, _ = _fully_fused_projection(means, covars, viewmats, Ks, width, height)
+    radii, means2d, depths, conics, _ = _fully_fused_projection(
+        means, covars, inputs["viewmats"], inputs["Ks"], width, height
+    )
     with torch.no_grad():
         box = radii[0, :, None].to(means)
         first, last = torch.floor((means2d[0] - box) / TILE), torch.ceil((means2d[0] + box) / TILE)
@@ -96,24 +90,14 @@ def _tile(
     return torch.cat([weights @ values[chosen], weights.sum(dim=1, keepdim=True)], dim=1)
 
 
-def gsplat_torch(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
+def gsplat_torch(**inputs: Any) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
     """The same by gsplat's projection, compositing in one pass over all pairs, and our replacements; float32 only, as
     gsplat's is.
     """
     from gsplat.cuda._torch_impl import _rasterize_to_pixels
 
-    view = _projected(means, quats, scales, viewmats, Ks, width, height)
-    values = torch.cat([colors, view["depths"][:, None]], dim=1)
+    view, opacities, width, height = _projected(inputs), inputs["opacities"], inputs["width"], inputs["height"]
+    values = torch.cat([inputs["colors"], view["depths"][:, None]], dim=1)
     offsets, splats = _tile_lists(view, width, height)
     with gsplat_on_cpu():
         return _rasterize_to_pixels(
@@ -123,24 +107,11 @@ def gsplat_torch(
         )  # fmt: skip
 
 
-def gsplat_kernels(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
+def gsplat_kernels(**inputs: Any) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"]]:
     """The same by gsplat's CUDA kernels; the tensors must be on a GPU."""
     from gsplat import rendering
 
-    splats: dict[str, Any] = dict(
-        means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks
-    )
-    return rendering.rasterization(**splats, width=width, height=height, packed=False, render_mode="RGB+D")[:2]
+    return rendering.rasterization(**inputs, packed=False, render_mode="RGB+D")[:2]
 
 
 @torch.no_grad()
@@ -178,14 +149,11 @@ def gsplat_on_cpu() -> Iterator[None]:
 
 
 @torch.no_grad()
-def _pairs(
-    _start: int, _end: int, _light: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int,
-    tile: int,
-    offsets: Tensor, splats: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+def _pairs(*given: Any) -> tuple[Tensor, Tensor, Tensor]:
     """All pairs to composite (Gaussian, pixel, camera), pixel by pixel and near ones first: stands in for a CUDA kernel
-    of gsplat.
+    of gsplat, whose arguments it has.
     """
+    means2d, conics, opacities, width, height, tile, offsets, splats = given[3:]  # those before say where to begin
     ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(splats)])]).tolist()
     found: list[tuple[Tensor, Tensor]] = []
     for number, (begin, end) in enumerate(zip(offsets.flatten().tolist(), ends, strict=True)):

@@ -7,15 +7,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from fb_core import checkpoint
 from fb_core.completion.duration import in_words
@@ -27,7 +24,6 @@ from fb_core.data.capture.undistort import is_straight
 from fb_core.data.photos.choice import doubtful, require_two_views
 from fb_core.data.photos.collection import read_photos
 from fb_core.data.photos.photo import Photo
-from fb_core.evaluation.self_consistency import self_consistency
 from fb_core.files.ownership import Target
 from fb_core.files.whole import whole_folder
 from fb_core.geometry.cameras import Pinholes
@@ -38,10 +34,11 @@ from fb_core.machine.clock import Clock
 from fb_core.machine.devices import chosen_device
 from fb_core.machine.resources import peak_memory_bytes
 from method_configs.commands.complete.forecast import forecast
-from method_configs.commands.complete.options import CHECKED, CompleteOptions
+from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.commands.complete.plan import Plan, pose_sampling
-from method_configs.commands.complete.report import announcement, no_cameras, report_of, what_was_found
+from method_configs.commands.complete.report import announcement, bars, no_cameras, report_of, what_was_found
+from method_configs.commands.complete.self_check import agreement
 
 _WORKING = {
     "file_path",
@@ -291,7 +288,7 @@ def _work(
         path = path_cameras(options.path, [found.camera(index) for index in found.trusted], views, size=plan.side)
     if len(context) < plan.photos:
         plan = Plan.of(len(context), views, model, options)
-    with _bars() as on_progress, clock.stage("new views"):
+    with bars() as on_progress, clock.stage("new views"):
         images = generate(
             [photos[index] for index in context],
             [found.camera(index) for index in context],
@@ -320,15 +317,15 @@ def _work(
     }
     new = NewViews(images=images, cameras=path, origins=origins)
     if options.check:
-        with _bars(), clock.stage("self-consistency"):
-            told["self_consistency"] = _self_consistency(photos, found, context, new, model, options)
+        with bars(), clock.stage("self-consistency"):
+            told["self_consistency"] = agreement(photos, found, context, new, model, options)
     return found, new, told
 
 
 def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock) -> FoundCameras:
     """And say what was found."""
     sampling = None if model is None else pose_sampling(model, options)
-    with _bars() as on_progress, clock.stage("cameras"):
+    with bars() as on_progress, clock.stage("cameras"):
         found = find_cameras(
             job.photos,
             method=options.cameras,
@@ -363,39 +360,9 @@ def _work_on_scene(
         return found, None, {}
     scene = SceneJob.of(found.as_used(job.photos), found, job.world.points_path, options, work)
     left = 60 * options.minutes - (time.perf_counter() - began)
-    with _bars() as on_progress, clock.stage("scene"):
+    with bars() as on_progress, clock.stage("scene"):
         new, told = complete_with_splats(scene, seconds=left, on_progress=on_progress)
     return found, new, told
-
-
-def _self_consistency(
-    photos: list[Photo],
-    found: FoundCameras,
-    context: list[int],
-    new: NewViews,
-    model: Fillerbuster,
-    options: CompleteOptions,
-) -> dict[str, Any]:
-    """Poses, views, poses: how far the cameras of some photos and new views, looked for once more, are from those that
-    were used.
-    """
-    method = "features" if found.method == "features" else "model"
-    images, cameras = [], []
-    for index in context[:CHECKED]:
-        images.append(photos[index].load(_CHECKED_SIDE))
-        cameras.append(found.camera(index).scaled(images[-1].shape[2], images[-1].shape[1]))
-    for view in strided_subset(len(new.images), CHECKED):
-        images.append(new.images[view])
-        cameras.append(new.cameras[view])
-    cameras = [camera.to(torch.float64) for camera in cameras]
-    sampling = pose_sampling(model, options)
-    errors = self_consistency(images, cameras, method=method, model=model, seed=options.seed, sampling=sampling)
-    return {
-        "method": method,
-        "photos": min(len(context), CHECKED),
-        "new_views": len(images) - min(len(context), CHECKED),
-        **errors,
-    }
 
 
 def _path_of_file(options: CompleteOptions, side: int) -> Pinholes | None:
@@ -406,25 +373,6 @@ def _path_of_file(options: CompleteOptions, side: int) -> Pinholes | None:
         return None
     cameras = read_camera_path(Path(options.path), size=side).cameras
     return cameras[strided_subset(len(cameras), options.views)]
-
-
-# ---- telling ---------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _bars() -> Iterator[Callable[[str, int, int], None]]:
-    """Progress on the terminal, one bar for each thing that is being done; nothing when it is not one."""
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-
-        def report(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = progress.add_task(what.capitalize(), total=total)
-            progress.update(tasks[what], completed=done, total=total)
-
-        yield report
 
 
 def _peak_memory_gib() -> float:

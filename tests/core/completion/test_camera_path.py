@@ -15,7 +15,8 @@ from nerfstudio.cameras.camera_paths import get_path_from_json
 
 from fb_core.completion.planning.plan import plan_completion
 from fb_core.completion.rounds import announcement, run_completion
-from fb_core.data.capture.camera_path import read_camera_path
+from fb_core.data.capture.camera_path import as_camera_path, read_camera_path
+from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.bridge import to_pinholes
 
 
@@ -32,6 +33,20 @@ def test_cameras_are_those_that_nerfstudio_reads(tmp_path: Path, width: int, hei
     expected = to_pinholes(theirs)
     for name in ("camera_to_world", "focal", "principal"):
         assert torch.allclose(getattr(cropped, name), getattr(expected, name).float(), atol=1e-4), name
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 36), (36, 64), (50, 50)])
+def test_a_path_that_is_written_is_read_as_it_was(tmp_path: Path, width: int, height: int):
+    centers = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    cameras = Pinholes.looking_at(
+        centers, centers * 2, up=torch.tensor([0.0, 0.0, 1.0]), fov_degrees=55.0, width=width, height=height
+    )
+    (tmp_path / "path.json").write_text(json.dumps(as_camera_path(cameras)))
+    read = read_camera_path(tmp_path / "path.json", size=max(width, height))
+    assert read.aspect == pytest.approx(width / height)
+    cropped = read.cameras.cropped((max(width, height) - width) // 2, (max(width, height) - height) // 2, width, height)
+    torch.testing.assert_close(cropped.camera_to_world, cameras.camera_to_world, atol=1e-6, rtol=0)
+    torch.testing.assert_close(cropped.focal, cameras.focal, atol=1e-4, rtol=0)
 
 
 def test_a_path_is_generated_where_it_is_even_outside_the_walls(tmp_path: Path):

@@ -163,7 +163,7 @@ def test_how_the_work_is_cut_does_not_count():
 
 def test_a_new_version_finds_nothing_of_the_old(monkeypatch):
     before = key()
-    monkeypatch.setattr(completion_cache, "_VERSION", 10**6)
+    monkeypatch.setattr(completion_cache, "VERSION", 10**6)
     assert key() != before
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from fb_core.completion.fly_through import generate, plan_passes
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.context_views import nearest_context
-from fb_core.completion.planning.plan import plan_completion, shell_of
+from fb_core.completion.planning.plan import plan_completion
+from fb_core.completion.planning.site import shell_of
 from fb_core.completion.requests import CompleteFrom, fan_from
 from fb_core.completion.results.completed_views import DENSIFY, CompletedViews, Origin
 from fb_core.data.photos.photo import Photo

@@ -155,7 +155,7 @@ def test_views_without_depth_without_colours_and_alike(count: int) -> None:
 class Fades(Knows):
     """Knows the wholly hidden views; in all others it is the more wrong the farther off a known pixel is."""
 
-    def complete(self, views, *, generator, sampling=None, on_step=None):
+    def complete(self, views, *, generator, sampling=None, on_step=None, prompt=None, current=None):
         right = super().complete(views, generator=generator, sampling=sampling, on_step=on_step)
         known = views.image_known[:, 0] >= 1
         away = angle_to_known(known | ~known.flatten(1).any(dim=1)[:, None, None], turned(*[0.0] * len(views)))

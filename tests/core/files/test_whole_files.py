@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[3]
 def way(request, monkeypatch: pytest.MonkeyPatch) -> str:
     """With the system's exchange of folders, and as on systems without it."""
     if request.param == "two renames":
-        monkeypatch.setattr(whole, "_exchange", lambda one, other: False)
+        monkeypatch.setattr(whole, "exchange", lambda one, other: False)
     return request.param
 
 
@@ -46,7 +46,7 @@ def test_this_system_exchanges_folders_in_one_step(tmp_path: Path):
         pytest.skip("renameat2 is Linux's")
     (tmp_path / "a").mkdir()
     (tmp_path / "b" / "inside").mkdir(parents=True)
-    assert whole._exchange(tmp_path / "a", tmp_path / "b")
+    assert whole.exchange(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "inside").exists() and not (tmp_path / "b" / "inside").exists()
 
 
@@ -100,7 +100,7 @@ from fb_core.files import whole
 from helpers.folders.whole_folders import content, names, write
 root, exchanges, there = Path(sys.argv[2]), sys.argv[3] == "one step", sys.argv[4] == "True"
 if not exchanges:
-    whole._exchange = lambda one, other: False
+    whole.exchange = lambda one, other: False
 ends, killed = set(), 0
 for moment in range(200):
     folder = root / str(moment) / "out"
@@ -119,7 +119,7 @@ for moment in range(200):
             return step
         for name in ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"):
             setattr(os, name, counted(getattr(os, name)))
-        whole._exchange = counted(whole._exchange)
+        whole.exchange = counted(whole.exchange)
         write(folder, "new")
         os._exit(0)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

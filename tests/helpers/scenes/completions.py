@@ -29,7 +29,9 @@ class MeanFiller:
 
     recommended_sampling = SamplingConfig()
 
-    def complete(self, views, *, generator, sampling=SamplingConfig(), on_step=None) -> Views:
+    def complete(
+        self, views, *, generator, sampling=SamplingConfig(), on_step=None, prompt=None, current=None
+    ) -> Views:
         self.asked.append(views)
         self.sampling.append(sampling)
         for step in range(sampling.steps):

@@ -22,7 +22,7 @@ class Knows(MeanFiller):
         super().__init__()
         self.truth, self.noise = Views.cat([fitted_view(view, 16) for view in truth]), noise
 
-    def complete(self, views, *, generator, sampling=None, on_step=None) -> Views:
+    def complete(self, views, *, generator, sampling=None, on_step=None, prompt=None, current=None) -> Views:
         self.asked.append(views)
         images = views.images.clone()
         for place in range(len(views)):

@@ -16,7 +16,8 @@ from helpers.scenes.coverages import AUTO, turning
 from helpers.scenes.trusted import views_of
 
 from fb_core.completion.options import CompletionConfig
-from fb_core.completion.planning.plan import CompletionPlan, Former, plan_completion
+from fb_core.completion.planning.plan import CompletionPlan, plan_completion
+from fb_core.completion.planning.site import Former
 from fb_core.completion.trust import Trust
 from fb_core.files.json_files import read_json
 from fb_core.geometry.cameras import Pinholes

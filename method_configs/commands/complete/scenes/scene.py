@@ -24,7 +24,7 @@ from fb_core.completion.fly_through import FoundCameras
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.data import media
-from fb_core.data.capture.camera_path import read_camera_path
+from fb_core.data.capture.camera_path import as_camera_path, read_camera_path
 from fb_core.data.capture.captures import FrameToWrite, read_capture, write_capture
 from fb_core.data.capture.frames import Capture
 from fb_core.data.capture.point_cloud import Points
@@ -33,7 +33,6 @@ from fb_core.data.photos.photo import Photo
 from fb_core.files.json_files import read_json
 from fb_core.files.whole import whole_file
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.rotations import flip_axes
 from fb_core.geometry.similarity import Similarity
 from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_core.geometry.viewpoints.paths import strided_subset
@@ -297,7 +296,7 @@ def completion_of(job: SceneJob, budget: SceneBudget) -> CompletionConfig:
     if not path.is_file():
         cameras = job.to_work.cameras(job.path(budget.film_side))
         with whole_file(path) as unfinished:
-            unfinished.write_text(json.dumps(_as_camera_path(cameras)), encoding="utf-8")
+            unfinished.write_text(json.dumps(as_camera_path(cameras)), encoding="utf-8")
     return CompletionConfig(
         enabled=options.generate,
         at_step=budget.schedule.complete_at,
@@ -313,26 +312,6 @@ def completion_of(job: SceneJob, budget: SceneBudget) -> CompletionConfig:
         trust="measured",
         film_path=path,
     )
-
-
-def _as_camera_path(cameras: Pinholes) -> dict[str, Any]:
-    """The path as nerfstudio's viewer saves it."""
-    poses = flip_axes(cameras.camera_to_world)
-    corner = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=poses.dtype)
-    degrees = torch.rad2deg(2 * torch.atan(cameras.height / 2 / cameras.focal[:, 1]))
-    return {
-        "camera_type": "perspective",
-        "render_width": cameras.width,
-        "render_height": cameras.height,
-        "camera_path": [
-            {
-                "camera_to_world": torch.cat([pose, corner]).flatten().tolist(),
-                "fov": float(fov),
-                "aspect": cameras.width / cameras.height,
-            }
-            for pose, fov in zip(poses, degrees, strict=True)
-        ],
-    }
 
 
 # ---- the film --------------------------------------------------------------------------------------------------------

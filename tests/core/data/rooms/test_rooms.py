@@ -214,7 +214,7 @@ def test_chunks_do_not_show(monkeypatch):
     room = make_room(3, FAMILIES["medium"])
     cameras = training_cameras(room, 3, size=16, generator=torch.Generator().manual_seed(0))
     whole = render(room, cameras)
-    monkeypatch.setattr("fb_core.data.rooms.ray_caster._CPU_PAIRS", 1000)
+    monkeypatch.setattr("fb_core.data.rooms.ray_caster.CPU_PAIRS", 1000)
     torch.testing.assert_close(render(room, cameras).rgb, whole.rgb)
 
 
@@ -422,7 +422,7 @@ def test_nothing_half_written_remains(capture, tmp_path, monkeypatch):
     def full_disk(*_):
         raise OSError("no space left")
 
-    monkeypatch.setattr(room_captures, "_write_ground_truth", full_disk)
+    monkeypatch.setattr(room_captures, "write_ground_truth", full_disk)
     with pytest.raises(OSError, match="no space"):
         write_room_capture(capture, tmp_path / "room", ground_truth=True)
     assert list(tmp_path.iterdir()) == []

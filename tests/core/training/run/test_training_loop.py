@@ -243,7 +243,7 @@ def test_a_signal_saves_and_ends_with_a_message_and_its_number(tmp_path, monkeyp
     def progress(stage, group):
         return contextlib.nullcontext(lambda done, of, losses: os.kill(os.getpid(), signal.SIGTERM))
 
-    monkeypatch.setattr(training_command, "_progress", progress)
+    monkeypatch.setattr(training_command, "progress_shown", progress)
     with caplog.at_level("INFO"), pytest.raises(SystemExit) as stopped:
         training_command.train_preset("toy", tmp_path, TrainOptions(device="cpu", stage="raymap-vae"))
     assert stopped.value.code == 128 + signal.SIGTERM
