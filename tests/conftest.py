@@ -6,6 +6,7 @@ import os
 import random
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import jaxtyping
@@ -101,3 +102,29 @@ def _tiny_capture_original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_capture(_tiny_capture_original: Path, tmp_path: Path) -> Path:
     """A fresh folder with a small valid capture (transforms.json, images, masks, points); a test may damage it."""
     return Path(shutil.copytree(_tiny_capture_original, tmp_path / "tiny_capture"))
+
+
+@pytest.fixture(scope="session")
+def _libraries(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the compiled splat library, made once for each run of the tests that ask for it."""
+    from fb_core.splatting.compiled import library
+
+    folder = tmp_path_factory.mktemp("libraries")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(library.CACHE_VARIABLE, str(folder))
+        try:
+            library.compile_libraries()
+        except library.NoCompiler as error:
+            pytest.skip(str(error))
+    return folder
+
+
+@pytest.fixture
+def compiled_library(_libraries: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of a library for both precisions, which is found inside the test."""
+    from fb_core.splatting.compiled import library
+
+    monkeypatch.setenv(library.CACHE_VARIABLE, str(_libraries))
+    library.loaded.cache_clear()
+    yield _libraries
+    library.loaded.cache_clear()
