@@ -503,7 +503,7 @@ def test_what_cannot_be_done_is_one_sentence_and_training_goes_on(tiny_capture: 
     attrs = generated(manager)
     bank = manager.generated_views
 
-    def refuse(self, views, *, generator, sampling, on_step, prompt=None):
+    def refuse(self, views, *, generator, sampling, on_step, prompt, current):
         assert prompt == "x"
         raise error
 
