@@ -21,7 +21,7 @@ def chosen_device(name: str | None) -> torch.device:
         device = torch.device(name)
         if device.type != "cuda":  # there it would take memory of a GPU that this process may not be meant to use
             torch.ones(1, device=device).item()  # meta holds no numbers
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # by the backend
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # which of them depends on the backend
         raise ValueError(
             f"device: expected one that this machine has, such as cpu, cuda or cuda:N, got {name!r}; leave it out to "
             "choose"

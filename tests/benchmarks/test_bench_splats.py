@@ -89,7 +89,7 @@ def test_the_row_of_gsplats_kernels_in_miniature(monkeypatch):
 
     monkeypatch.setattr(rendering, "rasterization", stand_in)
     scene = room_scene(100, 24)
-    exact = benchmark_splat._picture_and_gradients(benchmark_splat._ours, scene, torch.float64)
+    exact = benchmark_splat._picture_and_gradients(benchmark_splat.draw_torch, scene, torch.float64)
     row = benchmark_splat._kernels(scene, exact, "cpu", 1)
     assert (
         row["mean_error"] < 1e-6 and row["gradient_error"] < 1e-4 and row["both_seconds"] > row["forward_seconds"] > 0
@@ -102,7 +102,7 @@ def test_the_row_of_gsplats_kernels_in_miniature(monkeypatch):
 def test_gsplats_kernels_agree_with_ours(count: int, size: int):
     """Means over pixels and norms of gradients: at a handful of pixels float32 decides a threshold the other way."""
     scene = room_scene(count, size)
-    exact = benchmark_splat._picture_and_gradients(benchmark_splat._ours, scene, torch.float64)
+    exact = benchmark_splat._picture_and_gradients(benchmark_splat.draw_torch, scene, torch.float64)
     row = benchmark_splat._kernels(scene, exact, "cuda", 1)
     assert row["mean_error"] < 1e-5 and row["gradient_error"] < 1e-2
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from fb_core.machine.resources import usable_cores
 from fb_core.splatting.compiled.threads import fixed_threads
-from fb_core.splatting.rasterizer import Engine, rasterization
+from fb_core.splatting.rasterizer import rasterization
+from method_configs.benchmarks.splats.drawing import Draw, seconds_of
 from method_configs.benchmarks.splats.scenes import SplatScene
 
 
@@ -21,11 +22,11 @@ def compiled_rows(scene: SplatScene, runs: int) -> list[dict[str, Any]]:
     rows = []
     for threads in sorted({1, usable_cores()}):
         clock = time.process_time if threads == 1 else time.perf_counter
-        taken: dict[Engine, list[tuple[float, float]]] = {"torch": [], "compiled": []}
+        taken: dict[Draw, list[tuple[float, float]]] = {draw_torch: [], draw_compiled: []}
         with fixed_threads(threads):
             for _ in range(runs):
-                for engine, times in taken.items():
-                    times.append(_seconds(scene, engine, clock))
+                for draw, times in taken.items():
+                    times.append(seconds_of(draw, scene, clock))
         (slow_forward, slow), (forward, both) = (
             tuple(statistics.median(part) for part in zip(*times, strict=True)) for times in taken.values()
         )
@@ -38,19 +39,11 @@ def compiled_rows(scene: SplatScene, runs: int) -> list[dict[str, Any]]:
     return rows
 
 
+def draw_torch(**inputs: Any) -> tuple[Tensor, Tensor]:
+    """Colours with depth, and alphas, by torch alone."""
+    return rasterization(**inputs, render_mode="RGB+D", engine="torch")[:2]
+
+
 def draw_compiled(**inputs: Any) -> tuple[Tensor, Tensor]:
-    """Colours with depth, and alphas."""
+    """Colours with depth, and alphas, by the compiled library."""
     return rasterization(**inputs, render_mode="RGB+D", engine="compiled")[:2]
-
-
-def _seconds(scene: SplatScene, engine: Engine, clock: Any) -> tuple[float, float]:
-    """Forward, and forward and backward without the loss between them."""
-    inputs = scene.inputs(gradients=True)
-    begin = clock()
-    images, alphas = rasterization(**inputs, render_mode="RGB+D", engine=engine)[:2]
-    middle = clock()
-    loss = images.square().sum() + alphas.sum()
-    again = clock()
-    loss.backward()
-    end = clock()
-    return middle - begin, (middle - begin) + (end - again)

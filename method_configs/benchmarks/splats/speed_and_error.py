@@ -26,11 +26,11 @@ from fb_core.splatting.compiled.library import loaded
 from fb_core.splatting.rasterizer import rasterization
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.tiles import compositing as torch_compositing
-from method_configs.benchmarks.splats.compiled import compiled_rows, draw_compiled
+from method_configs.benchmarks.splats.compiled import compiled_rows, draw_compiled, draw_torch
+from method_configs.benchmarks.splats.drawing import Draw, loss_of, seconds_of
 from method_configs.benchmarks.splats.peers import gsplat_kernels, gsplat_torch, tile_loop
 from method_configs.benchmarks.splats.scenes import LEAVES, SplatScene, capture_scene, room_scene
 
-Draw = Callable[..., tuple[Tensor, Tensor]]
 SECONDS = {"10k@256": (0.06, 0.14), "50k@512": (0.13, 0.30), "200k@512": (0.5, 1.2)}
 """Bars: forward, forward and backward, on a machine that does 1e9 exponentials a second on one core."""
 TIMES_FASTER = {"10k@256": (8.0, 5.0), "50k@512": (20.0, 13.0)}
@@ -98,9 +98,9 @@ def run_splat(config: SplatBenchmark = SplatBenchmark(), *, on_cell: OnCell = la
 
 def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[dict[str, Any]]]) -> None:
     """All rows of one scene."""
-    exact = _picture_and_gradients(_ours, scene, torch.float64)
-    errors = _errors(_picture_and_gradients(_ours, scene), exact)
-    megabytes = _peak_megabytes(_ours, scene)
+    exact = _picture_and_gradients(draw_torch, scene, torch.float64)
+    errors = _errors(_picture_and_gradients(draw_torch, scene), exact)
+    megabytes = _peak_megabytes(draw_torch, scene)
     others = {"gsplat torch": gsplat_torch, "tile loop": tile_loop} if len(scene.means) <= config.most_for_peers else {}
     told = {}
     for name, draw in (others if config.peer_runs else {}).items():
@@ -109,9 +109,9 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
     rates = []
     for run in range(config.runs):  # in turn, so that a busy moment of the machine meets all of them
         rates.append(_exponentials_per_second())
-        times["ours"].append(_seconds(_ours, scene))
+        times["ours"].append(seconds_of(draw_torch, scene))
         for name in told if run < config.peer_runs else ():
-            times[name].append(_seconds(others[name], scene))
+            times[name].append(seconds_of(others[name], scene))
     forward, both = (statistics.median(taken) for taken in zip(*times["ours"], strict=True))
     parts["ours"].append(
         {
@@ -144,35 +144,11 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
     })  # fmt: skip
 
 
-def _ours(**inputs: Any) -> tuple[Tensor, Tensor]:
-    return rasterization(**inputs, render_mode="RGB+D", engine="torch")[:2]
-
-
-def _loss(images: Tensor, alphas: Tensor) -> Tensor:
-    """Some fixed direction in the space of pictures."""
-    generator = torch.Generator().manual_seed(0)
-    weights = [torch.randn(part.shape, generator=generator).to(part) for part in (images, alphas)]
-    return (images * weights[0]).sum() + (alphas * weights[1]).sum()
-
-
-def _seconds(draw: Draw, scene: SplatScene) -> tuple[float, float]:
-    """CPU seconds of forward, and of forward and backward without the loss between them."""
-    inputs = scene.inputs(gradients=True)
-    begin = time.process_time()
-    images, alphas = draw(**inputs)
-    middle = time.process_time()
-    loss = _loss(images, alphas)
-    again = time.process_time()
-    loss.backward()
-    end = time.process_time()
-    return middle - begin, (middle - begin) + (end - again)
-
-
 @torch.no_grad()
 def _seconds_without_gradients(scene: SplatScene) -> float:
     inputs = scene.inputs()
     begin = time.process_time()
-    _ours(**inputs)
+    draw_torch(**inputs)
     return time.process_time() - begin
 
 
@@ -181,7 +157,7 @@ def _picture_and_gradients(
 ) -> dict[str, Tensor]:
     inputs = scene.inputs(dtype, gradients=True, device=device)
     images, alphas = draw(**inputs)
-    _loss(images, alphas).backward()
+    loss_of(images, alphas).backward()
     return {"picture": images[..., :3].detach().cpu(), **{name: inputs[name].grad.cpu() for name in LEAVES}}
 
 
@@ -194,7 +170,7 @@ def _kernels(scene: SplatScene, exact: dict[str, Tensor], device: str, runs: int
         times = [time.perf_counter()]
         images, alphas = gsplat_kernels(**inputs)
         _finish(times)
-        loss = _loss(images, alphas)
+        loss = loss_of(images, alphas)
         _finish(times)
         loss.backward()
         _finish(times)
@@ -232,7 +208,7 @@ def _peak_megabytes(draw: Draw, scene: SplatScene) -> float:
     except (OSError, AttributeError):
         return float("nan")
     before = _status("VmRSS")
-    _loss(*draw(**inputs)).backward()
+    loss_of(*draw(**inputs)).backward()
     return (_status("VmHWM") - before) / 1024
 
 

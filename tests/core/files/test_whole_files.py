@@ -97,7 +97,7 @@ import os, shutil, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from fb_core.files import whole
-from helpers.folders.whole_folders import content, names, write
+from helpers.folders.whole_folders import content, ends_at_step, names, write
 root, exchanges, there = Path(sys.argv[2]), sys.argv[3] == "one step", sys.argv[4] == "True"
 if not exchanges:
     whole.exchange = lambda one, other: False
@@ -109,17 +109,7 @@ for moment in range(200):
         write(folder, "old")
     child = os.fork()
     if child == 0:
-        steps = []
-        def counted(function):
-            def step(*args, **kwargs):
-                if len(steps) == moment:
-                    os._exit(9)
-                steps.append(function)
-                return function(*args, **kwargs)
-            return step
-        for name in ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"):
-            setattr(os, name, counted(getattr(os, name)))
-        whole.exchange = counted(whole.exchange)
+        whole.exchange = ends_at_step(moment)(whole.exchange)
         write(folder, "new")
         os._exit(0)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -342,7 +332,7 @@ import os, shutil, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from fb_core.files import whole
-from helpers.folders.whole_folders import content, left_behind, names, write
+from helpers.folders.whole_folders import content, ends_at_step, left_behind, names, write
 root, stands, ends = Path(sys.argv[2]), sys.argv[3], set()
 for moment in range(200):
     place = root / str(moment) / "out"
@@ -353,16 +343,7 @@ for moment in range(200):
         os.rename(place.parent / "third", place)
     child = os.fork()
     if child == 0:
-        steps = []
-        def counted(function):
-            def step(*args, **kwargs):
-                if len(steps) == moment:
-                    os._exit(9)
-                steps.append(function)
-                return function(*args, **kwargs)
-            return step
-        for name in ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"):
-            setattr(os, name, counted(getattr(os, name)))
+        ends_at_step(moment)
         whole.swept(place.parent)
         os._exit(0)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

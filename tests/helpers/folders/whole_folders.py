@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fb_core.files.ownership import Target, foreign_files, kind_of
 from fb_core.files.whole import whole_folder
@@ -37,3 +40,24 @@ def left_behind(place: Path, *, old: str | None = None, new: str | None = None) 
         if text is not None:
             write(work / name, text)
     return work
+
+
+def ends_at_step(moment: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Have this process end, as if killed, instead of its next step in the file system once it has made so many.
+
+    Returns what makes a step of another function.
+    """
+    steps: list[Callable[..., Any]] = []
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def step(*args: Any, **kwargs: Any) -> Any:
+            if len(steps) == moment:
+                os._exit(9)
+            steps.append(function)
+            return function(*args, **kwargs)
+
+        return step
+
+    for name in ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"):
+        setattr(os, name, counted(getattr(os, name)))
+    return counted
