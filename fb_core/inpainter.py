@@ -5,12 +5,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -31,38 +29,19 @@ from fb_core.conditioning import (
 from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
 from fb_core.given_views import as_given, check_current, check_views, padded, working
-from fb_core.machine.precision import resolved
+from fb_core.machine.precision import in_own_precision, resolved
 from fb_core.memory.budget import Cut, MemoryEstimate, available_bytes, estimate, uncut
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
-from fb_core.sampling.integration.trajectory import OnStep, SamplingInterrupted
+from fb_core.sampling.integration.trajectory import OnStep, SamplingInterrupted, counted
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.preview import Progress
 from fb_core.sampling.randomness import noise_of, posterior_generators, random_orders
-from fb_core.sampling.starts import joining
+from fb_core.sampling.starts import Start, joining
 from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
 _logger = logging.getLogger(__name__)
-
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
-
-
-def _in_own_precision(
-    method: Callable[Concatenate[Fillerbuster, _P], _R],
-) -> Callable[Concatenate[Fillerbuster, _P], _R]:
-    """Keep a caller's autocast out: what is computed in which precision is said by the model and by the sampling
-    options.
-    """
-
-    @functools.wraps(method)
-    def called(self: Fillerbuster, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with torch.autocast(self.device.type, enabled=False):
-            return method(self, *args, **kwargs)
-
-    return called
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,20 +60,6 @@ class _Job:
     def canonical(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
         """Raymaps of the world in the canonical frame."""
         return raymaps if self.frame is None else self.frame.apply(raymaps)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Start:
-    """Where denoising starts."""
-
-    sampling: SamplingConfig
-    """With the strength that follows: 1 where nothing is started from."""
-    latents: Float[Tensor, "n 32 h w"] | None = None
-    """Of what is started from."""
-    joined: Float[Tensor, "n 32 h w"] | None = None
-    """Which of these count, and from when on (`fb_core.sampling.starts.joining`)."""
-    guess: Views | None = None
-    """What is told as a guess."""
 
 
 class Fillerbuster:
@@ -173,7 +138,7 @@ class Fillerbuster:
         return estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
 
     @torch.no_grad()
-    @_in_own_precision
+    @in_own_precision
     def complete(
         self,
         views: Views,
@@ -233,6 +198,42 @@ class Fillerbuster:
         del denoising
         return as_given(self._decode(job, latents), views)
 
+    @torch.no_grad()
+    @in_own_precision
+    def complete_often(
+        self,
+        views: Views,
+        *,
+        generators: Sequence[torch.Generator],
+        sampling: SamplingConfig | None = None,
+        on_step: OnStep | None = None,
+        prompt: str | None = None,
+        current: Views | None = None,
+    ) -> list[Views]:
+        """Several answers to one question, each to the bit what `complete` gives with its generator.
+
+        What is known is encoded, and shown to the network, once for all of them: known tokens that stand apart
+        (`DiTConfig.known_tokens`) cost nothing in all samples but the first. Raises as `complete` does.
+        """
+        check_views(views)
+        if current is not None:
+            check_current(current, views)
+        sampling = self.recommended_sampling if sampling is None else sampling
+        text = self._text_of(prompt if sampling.guidance_text else None)
+        job, denoising, answers = self._job(views, sampling, prompt), None, []
+        start = self._start(job, current)
+        for number, generator in enumerate(generators):
+            seed = int(torch.randint(0, 2**62, (), generator=generator))
+            if denoising is None or sampling.sample_posterior:  # else nothing of what is known depends on the seed
+                denoising = self._denoising(job, start, text, seed).bound()
+            else:
+                height, width = denoising.noise.shape[-2:]
+                noise = noise_of(seed, len(denoising.noise), (height, width)).to(self.device)
+                denoising = denoising.redrawn(noise, random_orders(seed))
+            latents = denoising.run(on_step=counted(on_step, number, len(generators)))
+            answers.append(as_given(self._decode(job, latents), views))
+        return answers
+
     def recover_raymaps(
         self, images: Float[Tensor, "n 3 h w"], *, generator: torch.Generator, sampling: SamplingConfig | None = None
     ) -> Float[Tensor, "n 6 h w"]:
@@ -280,13 +281,13 @@ class Fillerbuster:
         _logger.debug("%d views of %dx%d: %.2f GiB, %s", views, size[1], size[0], expected.peak / 2**30, expected.cut)
         return expected.cut
 
-    @_in_own_precision
+    @in_own_precision
     def denoising(self, views: Views, *, seed: int, sampling: SamplingConfig | None = None) -> Denoising:
         """What `complete` would denoise, with the start and the velocity of its trajectory, for measurements."""
         check_views(views)
         sampling = self.recommended_sampling if sampling is None else sampling
         job = self._job(views, sampling, None)
-        return self._denoising(job, _Start(sampling=sampling), self._text_of(None), seed)
+        return self._denoising(job, Start(sampling=sampling), self._text_of(None), seed)
 
     def _job(self, views: Views, sampling: SamplingConfig, prompt: str | None) -> _Job:
         """The views as the networks take them, their frame, and how the work is cut."""
@@ -295,11 +296,11 @@ class Fillerbuster:
         frame = frame_of_known_rays(ready.raymaps, ready.rays_known)
         return _Job(views=padded(ready), frame=frame, cut=cut, sampling=sampling)
 
-    def _start(self, job: _Job, current: Views | None) -> _Start:
+    def _start(self, job: _Job, current: Views | None) -> Start:
         """What denoising starts from and is told as a guess, of views that there are already."""
         sampling = job.sampling
         if current is None:
-            return _Start(sampling=sampling)
+            return Start(sampling=sampling)
         current = padded(working(current, self.device), mode="replicate")
         guess = current if sampling.guess != "start" else None
         if sampling.guess == "told":
@@ -308,11 +309,11 @@ class Fillerbuster:
             joined = joining(current, job.views)
             if joined is not None:
                 latents = self._encoded(current, job)
-                return _Start(sampling=sampling, latents=latents, joined=joined, guess=guess)
+                return Start(sampling=sampling, latents=latents, joined=joined, guess=guess)
             sampling = dataclasses.replace(sampling, strength=1.0)  # they tell nothing that is not known anyway
-        return _Start(sampling=sampling, guess=guess)
+        return Start(sampling=sampling, guess=guess)
 
-    def _denoising(self, job: _Job, start: _Start, text: Tensor | None, seed: int) -> Denoising:
+    def _denoising(self, job: _Job, start: Start, text: Tensor | None, seed: int) -> Denoising:
         """What is known of the views, encoded, with all draws."""
         views, guess, sampling = job.views, start.guess, start.sampling
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}

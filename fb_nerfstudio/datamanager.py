@@ -19,7 +19,7 @@ from fb_core.completion.inpainters.lazy_inpainter import LazyInpainter
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.requests import RegenerateRound, Request
 from fb_core.completion.results.completed_views import CompletedViews
-from fb_core.completion.rounds import Inpainter
+from fb_core.completion.samples import Inpainter
 from fb_core.data.capture.frames import Frame
 from fb_core.files.faults import Refused
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager

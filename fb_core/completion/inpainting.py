@@ -22,7 +22,6 @@ from fb_core.completion.planning.site import shell_of, thinned_points
 from fb_core.completion.results.completed_views import INPAINTED, CompletedViews, Origin
 from fb_core.completion.rounds import (
     CapturedView,
-    Inpainter,
     Named,
     RoundMaker,
     expectation,
@@ -31,6 +30,7 @@ from fb_core.completion.rounds import (
     model_name,
     open_cache,
 )
+from fb_core.completion.samples import Inpainter
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.paths import CaptureShape, strided_subset
@@ -106,7 +106,7 @@ def run_inpainting(
         fitted.append(fitted_view(dataclasses.replace(view, known=given), plan.size))
     _refuse_nothing_to_do(told)
     maker = RoundMaker(model=model, config=config, cache=open_cache(config), on_step=on_step, on_found=on_found)
-    squares = maker.images(Views.cat(fitted), planned)
+    squares = maker.samples(Views.cat(fitted), planned).images
     origin = Origin(
         role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash
     )

@@ -11,6 +11,7 @@ from fb_core.files.limits import MOST_SAMPLING_STEPS, MOST_SIDE, MOST_TRAINING_S
 from fb_core.machine.precision import Precision
 from fb_core.sampling.options import Guess, SamplingConfig
 
+_MOST_SAMPLES = 64
 _MOST_ANCHORS = 24  # where the capture decides
 
 
@@ -28,6 +29,10 @@ class PlacementConfig:
     """Steepest look up or down in captures that look outward (rooms)."""
     target_spread: float = 0.7
     """How far from the focus cameras look in captures that look inward (objects), in units of the capture's radius."""
+    wider_lens: float = 1.0
+    """Where the capture decides, captured cameras with a lens that is so many times wider (a ratio of focal lengths)
+    are candidates, too; 1 is none.
+    """
     clearance: float = 0.1
     """Least distance from seen geometry, in units of its median distance from the scene's centre; 0 allows any."""
 
@@ -121,6 +126,10 @@ class CompletionConfig:
     answers with the mean of what may be there, which only models learn that were trained on pure noise (the bundled
     one).
     """
+    samples: int = 1
+    """Samples of every generated view, of which in every neighbourhood the one nearest to their mean is taken. Several
+    cost so many times the steps (known views only once) and tell how far they differ (`trust` measured).
+    """
     guidance_unknown: float | None = None
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says
     nothing).
@@ -191,6 +200,7 @@ class CompletionConfig:
             ("densify_views", 0, MOST_VIEWS),
             ("rounds_apart", 0, MOST_TRAINING_STEPS),
             ("steps", 1, MOST_SAMPLING_STEPS),
+            ("samples", 1, _MOST_SAMPLES),
             ("window", 1, MOST_VIEWS),
         ):
             value = getattr(self, name)
@@ -217,6 +227,10 @@ class CompletionConfig:
         if self.image_size is not None and self.image_size < 16:
             raise ValueError(f"completion.image_size: expected at least 16 pixels, got {self.image_size}")
         require_between("completion.image_size", self.image_size or 16, 16, MOST_SIDE)
+        if not 1.0 <= self.placement.wider_lens <= 2.0:
+            raise ValueError(
+                f"completion.placement.wider_lens: expected a ratio from 1 to 2, got {self.placement.wider_lens}"
+            )
         for name in ("least_gain", "least_round_gain"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"completion.{name}: expected a share from 0 to 1, got {getattr(self, name)}")

@@ -13,14 +13,15 @@ from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.completion.duration import in_words
 from fb_core.completion.options import CompletionConfig, PlacementConfig
 from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, plan_completion
-from fb_core.completion.results.cache import CompletionCache, round_key
+from fb_core.completion.results.cache import CompletionCache
 from fb_core.completion.results.completed_views import ANCHOR, CompletedViews, Origin
+from fb_core.completion.samples import Inpainter, Question, Samples, draw
 from fb_core.data.media import resize
 from fb_core.geometry.cameras import Pinholes
 from fb_core.inpainter import SamplingConfig
@@ -32,43 +33,12 @@ __all__ = [
     "CompletedViews",
     "CompletionConfig",
     "CompletionPlan",
-    "Inpainter",
     "PlacementConfig",
     "announcement",
     "fitted_view",
     "plan_completion",
     "run_completion",
 ]
-
-
-@runtime_checkable
-class Inpainter(Protocol):
-    """What a round needs of ``fb_core.inpainter.Fillerbuster``."""
-
-    model_hash: str
-
-    @property
-    def size(self) -> int:
-        """Width and height of the views that the model was trained on, in pixels."""
-        ...
-
-    @property
-    def recommended_sampling(self) -> SamplingConfig:
-        """The options that the model's folder recommends."""
-        ...
-
-    def complete(
-        self,
-        views: Views,
-        *,
-        generator: torch.Generator,
-        sampling: SamplingConfig,
-        on_step: Callable[[int, int], None] | None,
-        prompt: str | None = None,
-        current: Views | None = None,
-    ) -> Views:
-        """The views with what was unknown generated; ``current`` is what generation starts from. Known pixels stay."""
-        ...
 
 
 @runtime_checkable
@@ -149,14 +119,13 @@ def run_completion(
         sequence = Views.cat([*known, Views.unknown(planned.cameras)])
         guess = None if ignored or first_guess is None else first_guess(planned.cameras)
         current = None if guess is None else Views.cat([*known, guess])
-        images = maker.images(sequence, planned, current)
-        views = _completed(planned, images, model.model_hash)
+        views = _completed(planned, maker.samples(sequence, planned, current), model.model_hash)
         if planned.role == ANCHOR:
             anchors = _as_views(views)
         yield views
 
 
-def _completed(planned: PlannedRound, images: UInt8[Tensor, "n h w 3"], model_hash: str) -> CompletedViews:
+def _completed(planned: PlannedRound, samples: Samples, model_hash: str) -> CompletedViews:
     """The views of a round, with where they came from; margins beside its aspect are not trained on."""
     origin = Origin(
         role=planned.role,
@@ -167,10 +136,11 @@ def _completed(planned: PlannedRound, images: UInt8[Tensor, "n h w 3"], model_ha
         aspect=planned.aspect,
     )
     return CompletedViews(
-        images=images,
-        masks=_shown(planned.aspect, images.shape[1]).expand(len(images), -1, -1, -1).contiguous(),
+        images=samples.images,
+        masks=_shown(planned.aspect, samples.images.shape[1]).expand(len(samples.images), -1, -1, -1).contiguous(),
         cameras=planned.cameras,
         origins=(origin,) * len(planned.cameras),
+        deviation=samples.deviation,
     )
 
 
@@ -194,42 +164,31 @@ class RoundMaker:
     on_found: Callable[[PlannedRound], None] | None = None
     """Called with a round that is loaded from the cache."""
 
-    def images(self, sequence: Views, planned: PlannedRound, current: Views | None = None) -> UInt8[Tensor, "n h w 3"]:
+    def samples(self, sequence: Views, planned: PlannedRound, current: Views | None = None) -> Samples:
         """Pictures of the sequence's last views, those of the round; generated from ``current`` where that is given.
 
         Raises ValueError as the model does.
         """
-        config, model, on_step = self.config, self.model, self.on_step
-        sampling, views, prompt = config.sampling(model.recommended_sampling), len(planned.cameras), planned.prompt
+        config, on_step, on_found = self.config, self.on_step, self.on_found
+        sampling = config.sampling(self.model.recommended_sampling)
         if current is not None:
             sampling = dataclasses.replace(sampling, strength=config.strength)
-        key = ""
-        if self.cache is not None:
-            asked = {"seed": planned.seed, "sampling": sampling, "model_hash": model.model_hash}
-            key = round_key(sequence, **asked, prompt=prompt, current=current)
-            kept = self.cache.find(key, views=views, size=sequence.size[0])
-            if kept is not None:
-                if self.on_found is not None:
-                    self.on_found(planned)
-                return kept
-        filled = model.complete(
-            sequence,
-            generator=torch.Generator().manual_seed(planned.seed),
+        question = Question(
+            sequence=sequence,
+            views=len(planned.cameras),
+            seed=planned.seed,
             sampling=sampling,
-            on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
-            prompt=prompt or None,
+            prompt=planned.prompt,
             current=current,
         )
-        new = filled[list(range(len(sequence) - views, len(sequence)))]
-        images = in_8_bits(new.images)
-        if self.cache is not None:
-            self.cache.keep(key, images)
-        return images
-
-
-def in_8_bits(images: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w 3"]:
-    """Pictures as the bank and the cache hold them."""
-    return (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().contiguous()
+        return draw(
+            question,
+            self.model,
+            samples=config.samples,
+            cache=self.cache,
+            on_step=None if on_step is None else lambda step, steps: on_step(planned, step, steps),
+            on_found=None if on_found is None else lambda: on_found(planned),
+        )
 
 
 def fitted_view(view: CapturedView, size: int) -> Views:
@@ -304,7 +263,7 @@ def expectation(sequences: Sequence[tuple[int, int]], size: int, config: Complet
         model.expected(views=known + generated, known=known, size=size, sampling=sampling, prompted=prompted)
         for known, generated in sequences
     ]
-    seconds, most = sum(one[0] for one in each), max(one[1] for one in each)
+    seconds, most = config.samples * sum(one[0] for one in each), max(one[1] for one in each)
     return f"; {in_words(seconds, most)}"
 
 

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.pixel_trust import LEAST, Curve, evidence_of, fitted_curve
-from fb_core.completion.results.cache import CompletionCache, round_key
-from fb_core.completion.rounds import CapturedView, Inpainter, fitted_rectangle, fitted_view, in_8_bits
+from fb_core.completion.results.cache import CompletionCache
+from fb_core.completion.rounds import CapturedView, fitted_rectangle, fitted_view
+from fb_core.completion.samples import Inpainter, Question, Samples, draw, in_8_bits, variance_of
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import Carried, carried_over
 from fb_core.views import Views
@@ -153,11 +154,7 @@ def measured_trust(
     count = min(_MOST_HIDDEN, len(context) // _FEWEST)
     if count == 0:
         return Trust(hidden=0, model=math.nan, mean=math.nan, nearest=math.nan)
-    places = (
-        torch.linspace(1, len(context) - 1, count + 2)[1:-1].round().long().tolist()
-        if count > 1
-        else [len(context) // 2]
-    )
+    places = _hidden_places(count, len(context))
     others = [place for place in range(len(context)) if place not in set(places)]
     truth = Views.cat([fitted_view(context[place], size) for place in [*others, *places]])
     truth = dataclasses.replace(truth, images=_as_kept(in_8_bits(truth.images)).to(truth.images))
@@ -165,7 +162,8 @@ def measured_trust(
     trial = _trial(
         truth, cameras, None if surroundings is None else surroundings(cameras), told=len(others), halves=count
     )
-    images = _as_kept(_generated(trial.asked, len(trial.asked), model, config, cache, on_step)).to(truth.images)
+    drawn = _generated(trial.asked, model, config, cache, on_step)
+    images = _as_kept(drawn.images).to(truth.images)
     told, hidden = truth[list(range(len(others)))], truth[list(range(len(others), len(truth)))]
     known = (hidden.image_known >= 1) & ~trial.gone[
         len(others) :, None
@@ -183,7 +181,7 @@ def measured_trust(
         nearest=_error(nearest, hidden.images, known),
         splats=math.nan if splats is None else _error(splats, hidden.images, known),
     )
-    return dataclasses.replace(found, curve=_curve(trial, images, baseline=min(found.mean, found.nearest)))
+    return dataclasses.replace(found, curve=_curve(trial, drawn, baseline=min(found.mean, found.nearest)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,15 +256,22 @@ def _hidden_parts(
     return (torch.einsum("nhwc,kc->nhwk", towards, looks) > math.cos(half)).any(dim=-1)
 
 
-def _curve(trial: _Trial, images: Float[Tensor, "n 3 h w"], *, baseline: float) -> Curve:
+def _curve(trial: _Trial, drawn: Samples, *, baseline: float) -> Curve:
     """The curve from evidence to trust, from all that was hidden."""
+    images = _as_kept(drawn.images).to(trial.truth.images)
     given, carried = trial.asked.image_known[:, 0] >= 1, trial.carried()
     depth = torch.full_like(images[:, 0], torch.inf) if trial.seen is None else trial.seen.depth
     depth = depth.masked_fill(given, torch.inf)  # generated pixels are compared with one another, not with the truth
     there = carried.there[:, 0] > 0
-    evidence = evidence_of(images, trial.cameras, depth, there | given, carried.images, there & ~given)
+    spread = variance_of(drawn.deviation)
+    evidence = evidence_of(images, trial.cameras, depth, there | given, carried.images, there & ~given, spread)
     error = (images - trial.truth.images).square().mean(dim=1)
     return fitted_curve(evidence, error, (trial.truth.image_known[:, 0] >= 1) & ~given, baseline=baseline)
+
+
+def _hidden_places(count: int, of: int) -> list[int]:
+    """Places of hidden views among the context: equally spaced, never the first."""
+    return torch.linspace(1, of - 1, count + 2)[1:-1].round().long().tolist() if count > 1 else [of // 2]
 
 
 def along_rays(depth: Float[Tensor, "n h w"], cameras: Pinholes) -> Float[Tensor, "n 1 h w"]:
@@ -287,26 +292,17 @@ def fitted_camera(view: CapturedView, size: int) -> Pinholes:
 
 def _generated(
     sequence: Views,
-    count: int,
     model: Inpainter,
     config: CompletionConfig,
     cache: CompletionCache | None,
     on_step: Callable[[int, int], None] | None,
-) -> UInt8[Tensor, "n h w 3"]:
-    """The last views of the sequence, in 8 bits: a picture from the cache and one that is new are the same."""
+) -> Samples:
+    """The sequence with what is hidden generated, in 8 bits: a picture from the cache and one that is new are the
+    same.
+    """
     sampling = dataclasses.replace(config.sampling(model.recommended_sampling), guess="start")
-    seed, key, found = (config.seed + _SEED) % 2**63, "", None
-    if cache is not None:
-        key = round_key(sequence, seed=seed, sampling=sampling, model_hash=model.model_hash)
-        found = cache.find(key, views=count, size=sequence.size[0])
-    if found is None:
-        done = model.complete(
-            sequence, generator=torch.Generator().manual_seed(seed), sampling=sampling, on_step=on_step
-        )
-        found = in_8_bits(done.images[-count:])
-        if cache is not None:
-            cache.keep(key, found)
-    return found
+    question = Question(sequence=sequence, views=len(sequence), seed=(config.seed + _SEED) % 2**63, sampling=sampling)
+    return draw(question, model, samples=config.samples, cache=cache, on_step=on_step)
 
 
 def _as_kept(pictures: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:

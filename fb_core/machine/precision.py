@@ -7,9 +7,11 @@ it, many times slower. A list of processors would be wrong for some; a probe tak
 
 from __future__ import annotations
 
+import functools
 import time
+from collections.abc import Callable
 from functools import cache
-from typing import Literal, get_args
+from typing import Concatenate, Literal, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
 
 import torch
 
@@ -20,6 +22,30 @@ _SIDE = 384
 _RUNS = 3
 _WORTH = 1.2
 """bfloat16 must be so many times faster to be worth its rounding."""
+
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+@runtime_checkable
+class _Placed(Protocol):
+    @property
+    def device(self) -> torch.device: ...
+
+
+_S = TypeVar("_S", bound=_Placed)
+
+
+def in_own_precision(method: Callable[Concatenate[_S, _P], _R]) -> Callable[Concatenate[_S, _P], _R]:
+    """Keep a caller's autocast out of a method: its object and options say what is computed in which precision."""
+
+    @functools.wraps(method)
+    def called(self: _S, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with torch.autocast(self.device.type, enabled=False):
+            return method(self, *args, **kwargs)
+
+    return called
 
 
 @cache

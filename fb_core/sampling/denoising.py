@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -48,6 +49,8 @@ class Denoising:
     """
     branches_at_once: int | None = None
     """Branches of guidance in one batch; None is all."""
+    prepared: Prepared | None = None
+    """The network bound to what is known, which other draws of noise may share; None makes it when it is needed."""
 
     def __post_init__(self) -> None:
         if self.sampling.strength < 1 and self.current is None:
@@ -65,8 +68,7 @@ class Denoising:
     ) -> Float[Tensor, "n 32 h w"]:
         """Latents at t = 0."""
         solver = "euler" if self.sampling.reference_compatible else self.sampling.solver
-        half = resolved(self.sampling.precision, self.noise.device) == torch.bfloat16
-        with torch.autocast(self.noise.device.type, torch.bfloat16, enabled=half):
+        with self._precision():
             return integrate(
                 self.field(),
                 self.start(),
@@ -76,6 +78,19 @@ class Denoising:
                 on_trajectory=on_trajectory,
                 resume=resume,
             )
+
+    def bound(self) -> Denoising:
+        """The same with the network bound to what is known: other draws (`redrawn`) need not do that again."""
+        with self._precision():
+            return dataclasses.replace(self, prepared=self._prepared())
+
+    def redrawn(self, noise: Float[Tensor, "n 32 h w"], orders: Orders) -> Denoising:
+        """The same question with other draws."""
+        return dataclasses.replace(self, noise=noise, orders=orders)
+
+    def _precision(self) -> torch.autocast:
+        half = resolved(self.sampling.precision, self.noise.device) == torch.bfloat16
+        return torch.autocast(self.noise.device.type, torch.bfloat16, enabled=half)
 
     @property
     def times(self) -> list[float]:
@@ -105,22 +120,32 @@ class Denoising:
             current = self.conditioning.channels[:, :STATE_CHANNELS].where(wholly_known(self.conditioning) > 0, current)
         return started(current, self.noise, sampling.strength)
 
-    def field(self) -> VelocityField:
-        """The guided velocity."""
-        sampling, variant = self.sampling, self.sampling.guidance
-        scale = guidance_map(self.conditioning, known=sampling.guidance_known, unknown=sampling.guidance_unknown)
-        parts, text = branches(self.conditioning, self.null, scale), self.text
-        guides = len(parts) == 2
-        prompted = text is not None and len(text) == 2
-        if text is not None and prompted:
+    def _scale(self) -> Float[Tensor, "n 32 h w"]:
+        sampling = self.sampling
+        return guidance_map(self.conditioning, known=sampling.guidance_known, unknown=sampling.guidance_unknown)
+
+    def _prepared(self) -> Prepared:
+        """The network under the branches of guidance."""
+        parts, text = branches(self.conditioning, self.null, self._scale()), self.text
+        if text is not None and self._prompted:
             text = torch.stack([text[0]] * len(parts) + [text[1]])
             parts = [*parts, self.conditioning]
-        text_scale = sampling.guidance_text if prompted else None
         channels = torch.stack([part.channels for part in parts])
         facts = stacked_facts(parts, self.dit.config)
-        prepared = Prepared(
+        return Prepared(
             self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts
         )
+
+    @property
+    def _prompted(self) -> bool:
+        return self.text is not None and len(self.text) == 2
+
+    def field(self) -> VelocityField:
+        """The guided velocity."""
+        sampling, variant, scale = self.sampling, self.sampling.guidance, self._scale()
+        prepared = self._prepared() if self.prepared is None else self.prepared
+        guides = prepared.branches - self._prompted == 2
+        text_scale = sampling.guidance_text if self._prompted else None
         if sampling.reference_compatible:
             cut = {"window": sampling.window, "rounds": sampling.rounds, "orders": self.orders}
             return reference_field(prepared, scale, text_scale=text_scale, **cut)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -13,9 +15,24 @@ from fb_core.masks import to_latent_grid
 from fb_core.sampling.integration.jumps import Jumping, jumps_of, piece_of
 from fb_core.sampling.integration.solvers import VelocityField
 from fb_core.sampling.integration.time_grids import reference_grid
+from fb_core.sampling.options import SamplingConfig
 from fb_core.views import Views
 
 _JOINING_TIMES = 4  # steps in which a mask between 0 and 1 says when a latent joins the sampling
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where denoising starts."""
+
+    sampling: SamplingConfig
+    """With the strength that follows: 1 where nothing is started from."""
+    latents: Float[Tensor, "n 32 h w"] | None = None
+    """Of what is started from."""
+    joined: Float[Tensor, "n 32 h w"] | None = None
+    """Which of these count, and from when on (`joining`)."""
+    guess: Views | None = None
+    """What is told as a guess."""
 
 
 def started(

@@ -14,7 +14,8 @@ from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import CompletionPlan, plan_completion
 from fb_core.completion.requests import merged
 from fb_core.completion.results.completed_views import CompletedViews
-from fb_core.completion.rounds import CapturedView, Inpainter, announcement, open_cache, run_completion
+from fb_core.completion.rounds import CapturedView, announcement, open_cache, run_completion
+from fb_core.completion.samples import Inpainter
 from fb_core.completion.trust import Trust, measured_trust
 from fb_core.data.capture.frames import Frame
 from fb_core.machine.precision import in_words

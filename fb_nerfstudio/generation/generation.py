@@ -13,7 +13,7 @@ from nerfstudio.engine.trainer import Trainer
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import CompletedViews, views_target
-from fb_core.completion.rounds import Inpainter
+from fb_core.completion.samples import Inpainter
 from fb_core.files.whole import remove_folder, whole_file
 from fb_core.geometry.shell import Shell
 from fb_nerfstudio.capture.captured_views import CapturedViewsDatamanager

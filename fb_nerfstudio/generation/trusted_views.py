@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fb_core.completion.pixel_trust import Curve, evidence_of
 from fb_core.completion.results.completed_views import CompletedViews
+from fb_core.completion.samples import variance_of
 from fb_core.completion.trust import Surroundings
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.shell import Shell, intersect
@@ -75,8 +76,10 @@ def with_pixel_trust(
         comparable = ~unseen.mask & (rendered.accumulation >= FIRM)
     # Views of one place are nearer to one another than to the world's origin.
     nearby = cameras.to(torch.float64).moved(-shell.center.to("cpu", torch.float64)).to(torch.float32)
-    shown = None if rendered is None else rendered.rgb
-    evidence = evidence_of(images, nearby, depth, ~unseen.mask, shown, comparable)
+    shown, spread = None if rendered is None else rendered.rgb, variance_of(views.deviation)
+    if spread is not None:
+        spread = F.interpolate(spread[:, None], size=size, mode="area")[:, 0]
+    evidence = evidence_of(images, nearby, depth, ~unseen.mask, shown, comparable, spread)
     trust = curve.trust(evidence)
     each = [round(float(one.double().mean()), 4) for one in trust]
     pixels = F.interpolate(trust[:, None], size=views.images.shape[1:3], mode="bilinear", align_corners=False)

@@ -4,7 +4,7 @@ name.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -68,10 +68,28 @@ class LazyInpainter:
         current: Views | None = None,
     ) -> Views:
         """``Fillerbuster.complete``; the first call loads the weights. Raises ValueError when they are broken."""
+        return self._loaded().complete(
+            views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt, current=current
+        )
+
+    def complete_often(
+        self,
+        views: Views,
+        *,
+        generators: Sequence[torch.Generator],
+        sampling: SamplingConfig,
+        on_step: Callable[[int, int], None] | None,
+        prompt: str | None = None,
+        current: Views | None = None,
+    ) -> list[Views]:
+        """``Fillerbuster.complete_often``; the first call loads the weights. Raises ValueError when they are broken."""
+        return self._loaded().complete_often(
+            views, generators=generators, sampling=sampling, on_step=on_step, prompt=prompt, current=current
+        )
+
+    def _loaded(self) -> Fillerbuster:
         if self._model is None:
             self._model = Fillerbuster.from_pretrained(
                 self._folder, device=self._device, text_encoder=self._text_encoder
             )
-        return self._model.complete(
-            views, generator=generator, sampling=sampling, on_step=on_step, prompt=prompt, current=current
-        )
+        return self._model

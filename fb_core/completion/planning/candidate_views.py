@@ -17,6 +17,7 @@ from fb_core.geometry.viewpoints.coverage import Coverage, shown_by
 from fb_core.geometry.viewpoints.paths import CaptureShape, sphere_directions
 
 _DIRECTIONS = 256
+_WITHOUT_PARALLAX = 3.0  # worth of what a captured camera with a wider lens adds, beside that of other new views
 SIDE_SEEN = math.cos(math.radians(30))
 """A side of an object is seen by cameras whose direction from its middle has at least this cosine with its own."""
 
@@ -35,6 +36,15 @@ class Candidates:
     """Which sides of an object each of them shows; None in rooms, where the lens decides."""
     unseen_by_capture: float = 0.0
     """Share of the surroundings that the captured pictures alone do not show."""
+    wider: Float[Tensor, "c"] | None = None
+    """By how much each of them shows more to all sides than usual new views, as a ratio of focal lengths; None is 1
+    everywhere.
+    """
+
+    @property
+    def worth(self) -> Float[Tensor, "c"] | None:
+        """How much more than others each is worth for what it adds: those without parallax, whose lens is wider."""
+        return None if self.wider is None else torch.where(self.wider > 1, _WITHOUT_PARALLAX, 1.0)
 
     def also_seen(self, seen: Bool[Tensor, "k"]) -> Candidates:
         """The same views, where more of the scene is seen."""
@@ -44,7 +54,29 @@ class Candidates:
         """What each of them shows, with a lens of half that opening."""
         if self.sides is not None:
             return self.sides
-        return shown_by(self.centers, self.looks, self.coverage.surface, half_angle_radians)
+        if self.wider is None:
+            return shown_by(self.centers, self.looks, self.coverage.surface, half_angle_radians)
+        shown = torch.zeros(len(self.centers), len(self.coverage.surface), dtype=torch.bool)
+        for ratio in self.wider.unique():
+            same = self.wider == ratio
+            half = math.atan(float(ratio) * math.tan(half_angle_radians))
+            shown[same] = shown_by(self.centers[same], self.looks[same], self.coverage.surface, half)
+        return shown
+
+    def and_before(self, first: Candidates) -> Candidates:
+        """Others of the same scene before these: of views that add as much, theirs are taken."""
+        wider = None
+        if first.wider is not None or self.wider is not None:
+            wider = torch.cat(
+                [one.centers.new_ones(len(one.centers)) if one.wider is None else one.wider for one in (first, self)]
+            )
+        return dataclasses.replace(
+            self,
+            centers=torch.cat([first.centers, self.centers]),
+            looks=torch.cat([first.looks, self.looks]),
+            sides=None if self.sides is None or first.sides is None else torch.cat([first.sides, self.sides]),
+            wider=wider,
+        )
 
 
 def looking_out(
@@ -63,6 +95,17 @@ def looking_out(
         looks=directions.repeat(len(places), 1),
         coverage=coverage,
         unseen_by_capture=coverage.unseen_share,
+    )
+
+
+def with_wider_lens(candidates: Candidates, captured: Pinholes, ratio: float) -> Candidates:
+    """The candidates of a room and, before them, the captured views with a wider lens: no parallax, so nothing in them
+    hides behind what the capture saw, and all around the picture continues.
+    """
+    looks = F.normalize(captured.camera_to_world[:, :, 2], dim=1)
+    wider = captured.centers.new_full((len(looks),), ratio)
+    return candidates.and_before(
+        dataclasses.replace(candidates, centers=captured.centers, looks=looks, sides=None, wider=wider)
     )
 
 

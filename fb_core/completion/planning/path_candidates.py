@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import torch
 import torch.nn.functional as F
 
 from fb_core.completion.planning.candidate_views import SIDE_SEEN, Candidates
@@ -21,10 +20,7 @@ def with_path(candidates: Candidates, path: Pinholes, shape: CaptureShape) -> Ca
     sides = candidates.sides
     if sides is not None:  # of an object: the sides that lie towards the camera
         around = F.normalize(candidates.coverage.surface - shape.focus, dim=1)
-        sides = torch.cat([F.normalize(path.centers - shape.focus, dim=1) @ around.T > SIDE_SEEN, sides])
-    return dataclasses.replace(
-        candidates,
-        centers=torch.cat([path.centers, candidates.centers]),
-        looks=torch.cat([looks, candidates.looks]),
-        sides=sides,
+        sides = F.normalize(path.centers - shape.focus, dim=1) @ around.T > SIDE_SEEN
+    return candidates.and_before(
+        dataclasses.replace(candidates, centers=path.centers, looks=looks, sides=sides, wider=None)
     )

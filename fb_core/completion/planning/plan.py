@@ -214,6 +214,7 @@ def _needed_rounds(
         places.shown(half_angle),
         most=sum(sizes.values()),
         least_gain=min(1.0, more * config.least_gain),
+        worth=places.worth,
     )
     taken = list(chosen.indices)
     if former is not None and former.number > 0 and sum(chosen.gains) < config.least_round_gain * more * left:
@@ -229,6 +230,8 @@ def _needed_rounds(
         new = Pinholes.looking_at(
             centers, targets, up=site.shape.up, fov_degrees=math.degrees(2 * half_angle), width=size, height=size
         )
+        if places.wider is not None:
+            new = dataclasses.replace(new, focal=new.focal / places.wider[group][:, None])
         new, seed = new.to(torch.float32), round_seed(config.seed, number)
         role = ANCHOR if number == 0 else DENSIFY
         rounds.append(PlannedRound(number=number, role=role, seed=seed, cameras=new, prompt=config.prompt))

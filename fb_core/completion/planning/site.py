@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.completion.options import PlacementConfig
-from fb_core.completion.planning.candidate_views import Candidates, looking_in, looking_out
+from fb_core.completion.planning.candidate_views import Candidates, looking_in, looking_out, with_wider_lens
 from fb_core.completion.results.completed_views import ANCHOR, DENSIFY
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.free_space import FreeSpace
@@ -164,6 +164,9 @@ class Site:
             places = looking_out(
                 torch.cat([standing, *around]), self.shape, coverage, max_pitch_degrees=self.placement.max_pitch_degrees
             )
+            if self.placement.wider_lens > 1:
+                captured = Pinholes.cat([self.cameras[index][[0]].scaled(1, 1) for index in chosen])
+                places = with_wider_lens(places, captured, self.placement.wider_lens)
             return places if former is None else places.also_seen(seen_by(self._of(former), surface, former.shown))
         places = looking_in(torch.cat(around), self.shape, self.cameras)
         whole = (

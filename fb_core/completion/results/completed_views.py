@@ -19,6 +19,8 @@ from fb_core.files.ownership import Target
 from fb_core.geometry.cameras import Pinholes
 
 ANCHOR, DENSIFY, REQUESTED, INPAINTED, BROUGHT = "anchor", "densify", "requested", "inpainted", "brought"
+UNSAMPLED = 255
+"""Deviation of a single sample, which nobody knows."""
 _STATE_VERSION = 1
 
 
@@ -85,6 +87,8 @@ class CompletedViews:
     """How far each pixel is believed, 255 wholly (:mod:`fb_core.completion.pixel_trust`); None where only the whole
     view's trust is known.
     """
+    deviation: UInt8[Tensor, "n h w 1"] | None = None
+    """Standard deviation over several samples: 254 is 1 or more, 255 of a single one. None where all are single."""
 
     def __post_init__(self) -> None:
         count, height, width, _ = self.images.shape
@@ -93,8 +97,11 @@ class CompletedViews:
             "cameras": (len(self.cameras), self.cameras.height, self.cameras.width),
         }
         told["origins"] = (len(self.origins), height, width)
-        if self.trust is not None:
-            told["trust"] = tuple(self.trust.shape[:3])
+        told |= {
+            name: tuple(one.shape[:3])
+            for name, one in (("trust", self.trust), ("deviation", self.deviation))
+            if one is not None
+        }
         for name, got in told.items():
             if got != (count, height, width):
                 raise ValueError(
@@ -113,6 +120,7 @@ class CompletedViews:
             cameras=self.cameras[index],
             origins=tuple(self.origins[i] for i in index),
             trust=None if self.trust is None else self.trust[index],
+            deviation=None if self.deviation is None else self.deviation[index],
         )
 
     @property
@@ -144,12 +152,18 @@ class CompletedViews:
     def cat(groups: Sequence[CompletedViews]) -> CompletedViews:
         """All views. Raises ValueError when the sizes differ."""
         known = any(group.trust is not None for group in groups)
+        sampled = any(group.deviation is not None for group in groups)
+        each = [
+            torch.full_like(group.masks, UNSAMPLED, dtype=torch.uint8) if group.deviation is None else group.deviation
+            for group in groups
+        ]
         return CompletedViews(
             cameras=Pinholes.cat([group.cameras for group in groups]),
             images=torch.cat([group.images for group in groups]),
             masks=torch.cat([group.masks for group in groups]),
             origins=tuple(origin for group in groups for origin in group.origins),
             trust=torch.cat([group.pixel_trust for group in groups]) if known else None,
+            deviation=torch.cat(each) if sampled else None,
         )
 
     def state(self) -> dict[str, Any]:
@@ -159,6 +173,7 @@ class CompletedViews:
             "images": self.images.cpu(),
             "masks": self.masks.cpu(),
             "trust": None if self.trust is None else self.trust.cpu(),
+            "deviation": None if self.deviation is None else self.deviation.cpu(),
             "camera_to_world": self.cameras.camera_to_world.cpu(),
             "focal": self.cameras.focal.cpu(),
             "principal": self.cameras.principal.cpu(),
@@ -183,9 +198,13 @@ class CompletedViews:
             height=state["height"],
         )
         origins = tuple(Origin(**origin) for origin in state["origins"])
-        trust = state.get("trust")  # runs of earlier versions have none
         return CompletedViews(
-            images=state["images"], masks=state["masks"], cameras=cameras, origins=origins, trust=trust
+            images=state["images"],
+            masks=state["masks"],
+            cameras=cameras,
+            origins=origins,
+            trust=state.get("trust"),  # runs of earlier versions have neither
+            deviation=state.get("deviation"),
         )
 
     def save_capture(self, folder: Path | Target) -> Capture:

@@ -83,7 +83,14 @@ def shown_by(
     return torch.cat(inside) if inside else torch.zeros(0, len(surface), dtype=torch.bool)
 
 
-def choose_views(coverage: Coverage, shown: Bool[Tensor, "c k"], *, most: int, least_gain: float) -> ChosenViews:
+def choose_views(
+    coverage: Coverage,
+    shown: Bool[Tensor, "c k"],
+    *,
+    most: int,
+    least_gain: float,
+    worth: Float[Tensor, "c"] | None = None,
+) -> ChosenViews:
     """The candidates that add most, one after the other, until the next one would add too little.
 
     A candidate adds the weight of the unseen points that it shows; points that a chosen view shows count less and less.
@@ -95,6 +102,7 @@ def choose_views(coverage: Coverage, shown: Bool[Tensor, "c k"], *, most: int, l
         shown: which surface points each candidate would show.
         most: views at most, 0 or more.
         least_gain: share of the unseen weight, from 0 to 1, that a view must add at least.
+        worth: how much more than others each candidate is worth for what it adds; None is 1 each.
 
     Raises ValueError for bounds out of their ranges.
     """
@@ -110,10 +118,10 @@ def choose_views(coverage: Coverage, shown: Bool[Tensor, "c k"], *, most: int, l
     known, indices, gains = coverage.seen.clone(), list[int](), list[float]()
     while len(indices) < most and len(shown):
         surroundings = (matrix @ known.to(matrix)) / size
-        worth = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
+        certain = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
         added = matrix @ need.float()
-        gain = torch.where((added > 0) & (added >= least), added * worth, 0.0)
-        best = int(gain.argmax())
+        gain = torch.where((added > 0) & (added >= least), added * certain, 0.0)
+        best = int((gain if worth is None else gain * worth).argmax())
         if float(gain[best]) <= 0:
             break
         indices.append(best)

@@ -15,6 +15,11 @@ OnStep = Callable[[int, int], None]
 """(steps done, steps in all), called after every step."""
 
 
+def counted(on_step: OnStep | None, number: int, of: int) -> OnStep | None:
+    """Steps of one trajectory, told as steps of all that follow one another."""
+    return None if on_step is None else lambda step, steps: on_step(number * steps + step, of * steps)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
     """A trajectory that is somewhere on its way."""

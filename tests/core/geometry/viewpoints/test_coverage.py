@@ -12,6 +12,8 @@ import torch
 from helpers.scenes.completions import MeanFiller, box_points
 from helpers.scenes.coverages import AUTO, UP, turning
 
+from fb_core.completion.options import CompletionConfig, PlacementConfig
+from fb_core.completion.planning.candidate_views import Candidates
 from fb_core.completion.planning.plan import plan_completion
 from fb_core.completion.rounds import announcement
 from fb_core.data.rooms.room import FAMILIES, make_room
@@ -203,3 +205,42 @@ def test_planned_cameras_stand_in_free_space(family: str) -> None:
         clearance = room.clearance(centers)
         stuck, total = stuck + int((clearance <= 0).sum()), total + len(centers)
     assert stuck == 0 and total > 10
+
+
+def test_a_wider_lens_at_captured_places_is_a_candidate_where_it_is_asked_for() -> None:
+    capture = turning(8, last=math.pi)
+    plain = plan_completion(capture, box_points(), AUTO, size=16)
+    same = dataclasses.replace(AUTO, placement=PlacementConfig(wider_lens=1.0))
+    again = plan_completion(capture, box_points(), same, size=16)
+    assert all(torch.equal(a.cameras.focal, b.cameras.focal) for a, b in zip(plain.rounds, again.rounds, strict=True))
+    wide = dataclasses.replace(AUTO, placement=PlacementConfig(wider_lens=1.5))
+    planned = plan_completion(capture, box_points(), wide, size=16).rounds[0].cameras
+    usual = float(plain.rounds[0].cameras.focal[0, 0])
+    wider = (planned.focal[:, 0] < 0.9 * usual).nonzero()[:, 0].tolist()
+    assert wider, "half of a room is unseen: what lies beside the captured pictures is known best"
+    standing = torch.cat([camera.centers for camera in capture]).float()
+    looks = torch.cat([camera.rotations[:, :, 2] for camera in capture]).float()
+    for place in wider:
+        assert float(planned.focal[place, 0]) == pytest.approx(usual / 1.5)
+        away = (standing - planned.centers[place]).norm(dim=1)
+        assert float(away.min()) < 1e-5
+        assert float((looks[away.argmin()] - planned.rotations[place, :, 2]).abs().max()) < 1e-4
+
+
+def test_a_wider_lens_shows_the_cone_of_its_own_opening() -> None:
+    surface = sphere_directions(400, like=torch.zeros(3))
+    coverage = Coverage(surface=surface, weight=torch.ones(400), seen=torch.zeros(400, dtype=torch.bool))
+    looks = torch.eye(3)[[0, 0, 1]]
+    candidates = Candidates(
+        centers=torch.zeros(3, 3), looks=looks, coverage=coverage, wider=torch.tensor([1.0, 2.0, 1.0])
+    )
+    shown, half = candidates.shown(0.4), math.atan(2 * math.tan(0.4))
+    assert torch.equal(shown[:2], torch.stack([surface[:, 0] > math.cos(0.4), surface[:, 0] > math.cos(half)]))
+    both = dataclasses.replace(candidates, wider=None).and_before(candidates)
+    assert torch.equal(both.shown(0.4)[:3], shown) and torch.equal(both.shown(0.4)[3], shown[0])
+
+
+@pytest.mark.parametrize("ratio", [0.9, 2.1, math.nan])
+def test_lenses_that_are_not_wider_or_too_wide_are_refused(ratio: float) -> None:
+    with pytest.raises(ValueError, match="wider_lens: expected a ratio from 1 to 2"):
+        CompletionConfig(placement=PlacementConfig(wider_lens=ratio))
