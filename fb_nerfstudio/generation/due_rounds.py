@@ -108,7 +108,7 @@ def _with_model(generation: Generation, scene: TrainedScene) -> CompletionPlan:
     model = generation.load_inpainter()
     inpaints, size = config.task == "inpaint", config.image_size or model.size
     if inpaints:
-        points = scene.seen_points(scene.cameras)
+        points = scene.seen_points(scene.planned_from)
         plan, announce = plan_inpainting(scene.cameras, points, config, size=size), announcement_of_inpainting
     else:
         plan = _plan(generation, scene, size=size)
@@ -130,7 +130,7 @@ def _plan(generation: Generation, scene: TrainedScene, *, size: int) -> Completi
     other.
     """
     config, state = generation.completion, generation.state
-    points = scene.seen_points(scene.cameras)
+    points = scene.seen_points(scene.planned_from)
     former = free = None
     if in_turn(config):
         former = former_of(state.automatic_views, scene.trained_splats, state.rounds.number)

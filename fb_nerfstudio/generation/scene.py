@@ -18,6 +18,7 @@ from fb_core.geometry.free_space import FreeSpace
 from fb_nerfstudio.capture.splat_renders import TRAINED_STEPS, TrainedSplats, free_space, surface_points
 
 _SURVEYED_CAMERAS = 48  # captured pictures that are rendered to learn where surfaces and free space are
+_PLANNED_CAMERAS = 200  # the same, to plan new views: a capture of thousands costs no more than one of hundreds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,15 @@ class TrainedScene:
     @property
     def surveyed(self) -> list[Pinholes]:
         """Some of the captured cameras, from all over the capture."""
-        return self.cameras[:: -(-len(self.cameras) // _SURVEYED_CAMERAS)]
+        return self._spread(_SURVEYED_CAMERAS)
+
+    @property
+    def planned_from(self) -> list[Pinholes]:
+        """More of them: all of a capture of usual size."""
+        return self._spread(_PLANNED_CAMERAS)
+
+    def _spread(self, most: int) -> list[Pinholes]:
+        return self.cameras[:: -(-len(self.cameras) // most)]
 
     def seen_points(self, cameras: Sequence[Pinholes]) -> Float[Tensor, "m 3"] | None:
         """Surface points: from structure from motion if the capture brings them, and once the splats are trained what
