@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -22,46 +23,43 @@ _OVERHEAD = 2.2  # a step takes so many times what its products alone would take
 _TRIAL_SECONDS = 0.05
 
 
-def expected_seconds(
-    model: Fillerbuster, *, views: int, known: int, side: int, sampling: SamplingConfig, recovers_rays: bool = False
-) -> float:
+@dataclass(frozen=True, kw_only=True)
+class SquareSequence:
+    """Square views that the model is to complete together."""
+
+    views: int
+    """Of the sequence."""
+    known: int
+    """Views of it that have a picture."""
+    side: int
+    """Of the views, pixels."""
+    recovers_rays: bool = False
+    """Whether raymaps are decoded instead of pictures."""
+
+
+def expected_seconds(model: Fillerbuster, sequence: SquareSequence, sampling: SamplingConfig) -> float:
     """:func:`seconds_of` a model that is loaded; where it stands decides the machine."""
-    return seconds_of(
-        model.config,
-        model.device,
-        model.dit.dtype,
-        views=views,
-        known=known,
-        side=side,
-        sampling=sampling,
-        recovers_rays=recovers_rays,
-    )
+    return seconds_of(model.config, model.device, model.dit.dtype, sequence, sampling)
 
 
 def seconds_of(
     model: ModelConfig,
     device: torch.device,
     dtype: torch.dtype,
-    *,
-    views: int,
-    known: int,
-    side: int,
+    sequence: SquareSequence,
     sampling: SamplingConfig,
-    recovers_rays: bool = False,
 ) -> float:
-    """Seconds that completing square views takes, right within a factor of two or so; no weights are needed to tell.
+    """Seconds that completing a sequence takes, right within a factor of two or so; no weights are needed to tell.
 
     Args:
         model: the networks' architecture.
         device: where they run.
         dtype: the transformer's precision.
-        views: of the sequence.
-        known: of them have a picture.
-        side: of the views in pixels.
+        sequence: what is completed.
         sampling: steps, window and rounds.
-        recovers_rays: raymaps are decoded instead of pictures.
     """
-    size = -(-side // SIDE_MULTIPLE) * SIDE_MULTIPLE
+    views = sequence.views
+    size = -(-sequence.side // SIDE_MULTIPLE) * SIDE_MULTIPLE
     config = model.transformer
     tokens = (size // (model.image_vae.factor * config.patch)) ** 2
     window = min(sampling.window or views, views)
@@ -72,9 +70,8 @@ def seconds_of(
     )  # projections; attention
     a_pass = config.depth * per_token * tokens * window
     encoded = views * (_flops(model.image_vae, size)[0] + _flops(model.raymap_vae, size)[0])
-    decoded = (views if recovers_rays else views - known) * _flops(
-        model.raymap_vae if recovers_rays else model.image_vae, size
-    )[1]
+    decoder = model.raymap_vae if sequence.recovers_rays else model.image_vae
+    decoded = (views if sequence.recovers_rays else views - sequence.known) * _flops(decoder, size)[1]
     rate = _rate(str(device), dtype)
     return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
 

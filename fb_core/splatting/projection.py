@@ -84,12 +84,32 @@ class Projection:
     """Determinant of the blurred screen covariance, pixel^4. Constant for autograd."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Gaussians:
+    """N Gaussians in the world, as `rasterizer.rasterization` is given them."""
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"] | None
+    """Rotations (wxyz) of any length; a zero quaternion is the identity rotation and gets a zero gradient."""
+    scales: Float[Tensor, "n 3"] | None
+    covars: Float[Tensor, "n 3 3"] | None
+    """Where given, in place of quats and scales."""
+    opacities: Float[Tensor, " n"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Constants:
+    """What decides how Gaussians are projected, and gets no gradient."""
+
+    Ks: Float[Tensor, "c 3 3"]
+    opacities: Float[Tensor, " n"]
+    usable: Bool[Tensor, " n"] | None
+    """Rows where it is False are never drawn; None for all that are."""
+    settings: ProjectionSettings
+
+
 def project_splats(
-    means: Float[Tensor, "n 3"],
-    quats: Float[Tensor, "n 4"] | None,
-    scales: Float[Tensor, "n 3"] | None,
-    opacities: Float[Tensor, " n"],
-    covars: Float[Tensor, "n 3 3"] | None,
+    splats: Gaussians,
     viewmats: Float[Tensor, "c 4 4"],
     Ks: Float[Tensor, "c 3 3"],
     usable: Bool[Tensor, " n"] | None,
@@ -97,12 +117,11 @@ def project_splats(
 ) -> Projection:
     """Project all Gaussians into all cameras, differentiable in means, quats, scales, covars and viewmats.
 
-    `quats` (wxyz) may have any length; a zero quaternion is the identity rotation and gets a zero gradient. `covars`,
-    where given, replaces quats and scales. Rows where `usable` is False are never drawn. Gradients do not flow to Ks or
-    opacities.
+    Rows where `usable` is False are never drawn. Gradients do not flow to Ks or opacities.
     """
+    constants = _Constants(Ks=Ks, opacities=splats.opacities.detach(), usable=usable, settings=settings)
     means2d, conics, depths, compensations, radii, determinants = _Project.apply(
-        means, quats, scales, covars, viewmats, opacities.detach(), Ks, usable, settings
+        splats.means, splats.quats, splats.scales, splats.covars, viewmats, constants
     )
     return Projection(
         means2d=means2d,
@@ -139,11 +158,12 @@ def _hidden(view: Footprint, radii: tuple[Tensor, Tensor], opacity: Tensor, sett
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, covars, viewmats, opacities, Ks, usable, settings: ProjectionSettings):
+    def forward(ctx, means, quats, scales, covars, viewmats, constants: _Constants):
         cameras, n = viewmats.shape[0], means.shape[0]
+        opacities, usable, settings = constants.opacities, constants.usable, constants.settings
         floor, square = settings.semantics.compensation_floor, settings.semantics.square_boxes
         with single_thread():
-            lenses = [Lens.of(K, settings.width, settings.height) for K in Ks]
+            lenses = [Lens.of(K, settings.width, settings.height) for K in constants.Ks]
             shapes = shapes_of(quats, scales, covars)
             means2d, conics = means.new_empty(cameras, n, 2), means.new_empty(cameras, n, 3)
             depths, compensations, determinants = (means.new_empty(cameras, n) for _ in range(3))
@@ -207,4 +227,4 @@ class _Project(torch.autograd.Function):
                         total.index_add_(0, rows, part)
                 if totals[4] is not None:
                     totals[4][camera] = leaving.viewmat
-        return (*totals, None, None, None, None)
+        return (*totals, None)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any, Literal
 
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from fb_core.files.limits import MOST_PIXELS
 from fb_core.splatting.compiled.compositing import MOST_CHANNELS, can_composite, composite_compiled
-from fb_core.splatting.projection import ALPHA_MIN, SEMANTICS, Projection, ProjectionSettings, project_splats
+from fb_core.splatting.projection import ALPHA_MIN, SEMANTICS, Gaussians, Projection, ProjectionSettings, project_splats
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.spherical_harmonics import MAX_DEGREE, sh_colors
 from fb_core.splatting.tiles.cells import CELL_WIDTH, CellGrid, Ellipses, tile_bounds
@@ -89,7 +90,9 @@ def rasterization(
     Raises:
         ValueError: for shapes, dtypes or options that do not fit.
     """
-    _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgrounds, sh_degree, render_mode)
+    splats = Gaussians(means=means, quats=quats, scales=scales, covars=covars, opacities=opacities)
+    _check(splats, viewmats, Ks, backgrounds)
+    _check_colors(splats, viewmats.shape[0], colors, backgrounds, sh_degree, render_mode)
     _check_options(width, height, packed, tile_size, rasterize_mode, semantics)
     _check_numbers(
         viewmats.shape[0] * width * height,
@@ -109,11 +112,11 @@ def rasterization(
         semantics=SEMANTICS[semantics],
     )
     with single_thread():
-        usable, dropped = _usable(means, quats, scales, opacities, covars, _used_colors(colors, sh_degree, render_mode))
+        usable, dropped = _usable(splats, _used_colors(colors, sh_degree, render_mode))
         if usable is not None:
-            opacities = opacities.masked_fill(~usable, 0.0)
-        projection = project_splats(means, quats, scales, opacities, covars, viewmats, Ks, usable, settings)
-        opacities = opacities.expand(viewmats.shape[0], -1)
+            splats = replace(splats, opacities=opacities.masked_fill(~usable, 0.0))
+        projection = project_splats(splats, viewmats, Ks, usable, settings)
+        opacities = splats.opacities.expand(viewmats.shape[0], -1)
         if settings.antialiased:
             opacities = opacities * projection.compensations
         chosen = _chosen(projection, opacities)
@@ -129,7 +132,7 @@ def rasterization(
         )
         compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=absgrad)
         images, alphas = _compositor(engine, values)(
-            projection.means2d, projection.conics, opacities, values, ellipses, grid, compositing
+            projection.means2d, projection.conics, opacities, values, ellipses, compositing
         )
         images = _finish(images, alphas, backgrounds, render_mode)
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
@@ -157,22 +160,14 @@ def _used_colors(colors: Tensor, sh_degree: int | None, render_mode: RenderMode)
     return used.transpose(0, 1) if used.ndim == (3 if sh_degree is None else 4) else used
 
 
-def _usable(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    covars: Tensor | None,
-    colors: Tensor | None,
-):
+def _usable(splats: Gaussians, colors: Tensor | None) -> tuple[Tensor | None, int]:
     """Which Gaussians have finite values only (None = all of them), and how many have not."""
     with torch.no_grad():
-        given = [t for t in (means, quats, scales, covars, colors) if t is not None]
-        if bool(
-            torch.stack([t.sum() for t in (*given, opacities)]).isfinite().all()
-        ):  # the quickest look at all of them
+        given = [t for t in (splats.means, splats.quats, splats.scales, splats.covars, colors) if t is not None]
+        # The sums are the quickest look at all of them.
+        if bool(torch.stack([t.sum() for t in (*given, splats.opacities)]).isfinite().all()):
             return None, 0
-        finite = opacities.isfinite()
+        finite = splats.opacities.isfinite()
         for tensor in given:
             finite = finite & tensor.flatten(1).isfinite().all(dim=1)
         dropped = int((~finite).sum())
@@ -236,6 +231,7 @@ def _ellipses(
         return Ellipses(
             chosen=chosen,
             camera=None if cameras == 1 else torch.div(chosen, number, rounding_mode="floor"),
+            grid=grid,
             x=x,
             y=y,
             A=A,
@@ -293,18 +289,19 @@ def _expect(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> 
         )
 
 
-def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgrounds, sh_degree, render_mode) -> None:
+def _check(splats: Gaussians, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None) -> None:
+    means = splats.means
     if means.ndim != 2 or means.shape[1] != 3 or means.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means should be float32 or float64 [n, 3] but is {means.dtype} {tuple(means.shape)}.")
     number, cameras = means.shape[0], viewmats.shape[0]
-    if covars is not None:
-        _expect("covars", covars, (number, 3, 3), means)
-    elif quats is None or scales is None:
+    if splats.covars is not None:
+        _expect("covars", splats.covars, (number, 3, 3), means)
+    elif splats.quats is None or splats.scales is None:
         raise ValueError("quats and scales are needed where covars is not given.")
     else:
-        _expect("quats", quats, (number, 4), means)
-        _expect("scales", scales, (number, 3), means)
-    _expect("opacities", opacities, (number,), means)
+        _expect("quats", splats.quats, (number, 4), means)
+        _expect("scales", splats.scales, (number, 3), means)
+    _expect("opacities", splats.opacities, (number,), means)
     _expect("viewmats", viewmats, (cameras, 4, 4), means)
     _expect("Ks", Ks, (cameras, 3, 3), means)
     for name, tensor in {"viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds}.items():
@@ -314,11 +311,22 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, covars, backgr
             raise ValueError(f"{name} should be finite but holds NaN or infinity: leave that camera out or repair it.")
     if not bool((Ks[:, [0, 1], [0, 1]] > 0).all()):
         raise ValueError(f"Ks should have focal lengths above 0 but has {Ks[:, [0, 1], [0, 1]].tolist()}.")
+
+
+def _check_colors(
+    splats: Gaussians,
+    cameras: int,
+    colors: Tensor,
+    backgrounds: Tensor | None,
+    sh_degree: int | None,
+    render_mode: RenderMode,
+) -> None:
     if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
         raise ValueError(f"render_mode should be RGB, D, ED, RGB+D or RGB+ED but is {render_mode!r}.")
     if render_mode in ("D", "ED"):
         return
     trailing = 1 if sh_degree is None else 2
+    means, number = splats.means, splats.means.shape[0]
     leading = (number,) if colors.ndim == 1 + trailing else (cameras, number)
     _expect("colors", colors, (*leading, *colors.shape[-trailing:]), means)
     if sh_degree is not None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from fb_core import checkpoint
-from fb_core.completion.duration import seconds_of
+from fb_core.completion.duration import SquareSequence, seconds_of
 from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster, SamplingConfig
 from fb_core.memory import budget as memory
 from fb_core.views import Views
@@ -54,8 +54,8 @@ class LazyInpainter:
         """
         device, dtype = torch.device(self._device), torch.float32
         needed = memory.estimate(views, (size, size), dtype, model=self._config, sampling=sampling, prompted=prompted)
-        seconds = seconds_of(self._config, device, dtype, views=views, known=known, side=size, sampling=sampling)
-        return seconds, needed.peak
+        sequence = SquareSequence(views=views, known=known, side=size)
+        return seconds_of(self._config, device, dtype, sequence, sampling), needed.peak
 
     def complete(
         self,

@@ -70,11 +70,10 @@ def composite_compiled(
     opacities: Float[Tensor, "c n"],
     values: Float[Tensor, "v d"],
     ellipses: Ellipses,
-    grid: CellGrid,
     settings: CompositingSettings,
 ) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
     """As `tiles.compositing.composite`; the library must have been made (`can_composite`)."""
-    return _Compiled.apply(means2d, conics, opacities, values, ellipses, grid, settings)
+    return _Compiled.apply(means2d, conics, opacities, values, ellipses, settings)
 
 
 def _library(dtype: torch.dtype) -> ctypes.CDLL:
@@ -84,11 +83,9 @@ def _library(dtype: torch.dtype) -> ctypes.CDLL:
     return library
 
 
-def _lists(
-    ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, light: Float[Tensor, "cells p"]
-) -> Lists:
+def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Float[Tensor, "cells p"]) -> Lists:
     """The lists of one run of Gaussians, without the cells that the runs before have made opaque."""
-    library = _library(light.dtype)
+    library, grid = _library(light.dtype), ellipses.grid
     bounds = (None, None) if ellipses.bounds is None else (ellipses.bounds[0], ellipses.bounds[1])
     columns = [
         ellipses.x, ellipses.y, strips.skew, strips.over_A, strips.over_yy, strips.reach, strips.turn,
@@ -145,17 +142,16 @@ class _Run:
 
 class _Compiled(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means2d, conics, opacities, values, ellipses: Ellipses, grid: CellGrid,
-                settings: CompositingSettings):  # fmt: skip
-        library, runs = _library(values.dtype), list[_Run]()
+    def forward(ctx: Any, means2d, conics, opacities, values, ellipses: Ellipses, settings: CompositingSettings):
+        library, runs, grid = _library(values.dtype), list[_Run](), ellipses.grid
         needed = any(ctx.needs_input_grad[:4])
         pixels = grid.cell_width * grid.cell_height
         with single_thread():
-            table, strips = table_of(ellipses, values, grid, settings.alpha_cap), measure_strips(ellipses, grid)
+            table, strips = table_of(ellipses, values, settings.alpha_cap), measure_strips(ellipses)
             image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
             light = values.new_ones(grid.count, pixels)
             for run in slabs(strips, settings.rows_per_list):
-                lists = _lists(ellipses, strips, run, grid, light)
+                lists = _lists(ellipses, strips, run, light)
                 scene = _scene(table, lists, grid)
                 stop = torch.empty(light.shape, dtype=_WHOLE[values.dtype])
 
@@ -172,14 +168,14 @@ class _Compiled(torch.autograd.Function):
                     runs.append(_Run(lists=lists, stop=stop, light=light.clone()))
             colors, alphas = to_image(image[:, :-1], grid), to_image(image[:, -1:], grid)
         ctx.save_for_backward(means2d, conics, opacities, values)
-        ctx.ellipses, ctx.grid, ctx.settings, ctx.table, ctx.runs = ellipses, grid, settings, table, runs
+        ctx.ellipses, ctx.settings, ctx.table, ctx.runs = ellipses, settings, table, runs
         return colors, alphas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor, v_alphas: Tensor):  # type: ignore[override]
         means2d, conics, opacities, values = ctx.saved_tensors
-        ellipses, grid, settings, table = ctx.ellipses, ctx.grid, ctx.settings, ctx.table
+        ellipses, grid, settings, table = ctx.ellipses, ctx.ellipses.grid, ctx.settings, ctx.table
         library, channels = _library(values.dtype), values.shape[1]
         with single_thread():
             upstream = to_cells([v_colors, v_alphas], grid)
@@ -206,7 +202,7 @@ class _Compiled(torch.autograd.Function):
             v_means2d, v_conics, v_opacities = gradients_of(
                 sums, means2d, conics, opacities, ellipses, settings.absgrad
             )
-        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None
 
 
 _WHOLE = {torch.float32: torch.int32, torch.float64: torch.int64}

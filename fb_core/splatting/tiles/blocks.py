@@ -137,7 +137,7 @@ def _monomials(grid: CellGrid, like: Tensor) -> Float[Tensor, "6 p"]:
     return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])
 
 
-def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> Table:
+def table_of(ellipses: Ellipses, values: Tensor, cap: float) -> Table:
     """What blocks read of every Gaussian, a row each: logarithm of the opacity, place, shape, values, and 1."""
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
     used = GEOMETRY + values.shape[1] + 1
@@ -149,9 +149,9 @@ def table_of(ellipses: Ellipses, values: Tensor, grid: CellGrid, cap: float) -> 
     return Table(
         rows=rows,
         channels=values.shape[1] + 1,
-        monomials=_monomials(grid, values),
+        monomials=_monomials(ellipses.grid, values),
         halves=values.new_tensor([[-0.5], [-1.0], [-0.5]]),
-        centers=torch.stack(grid.centers(values)),
+        centers=torch.stack(ellipses.grid.centers(values)),
         alpha_threshold=float(below),
         cap=cap,
     )

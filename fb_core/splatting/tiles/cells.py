@@ -73,6 +73,8 @@ class Ellipses:
     determinant: Float[Tensor, " v"]
     """1 / (A C - B^2), as the projection knows it: from the conic it would cancel for needles."""
     opacity: Float[Tensor, " v"]
+    grid: CellGrid
+    """The cells of the pictures that they lie in."""
     bounds: tuple[Tensor, Tensor, Tensor, Tensor] | None
     """gsplat 1.4: first and last + 1 cell column and row of the tiles that the square box touches (whole numbers as
     floats).
@@ -130,9 +132,10 @@ def _cell_range(first: Tensor, last: Tensor, size: int, limit: int) -> tuple[Ten
     return low, high
 
 
-def measure_strips(ellipses: Ellipses, grid: CellGrid) -> Strips:
+def measure_strips(ellipses: Ellipses) -> Strips:
     """Where each ellipse begins and ends, cell row by cell row."""
     A, B, C, determinant = ellipses.A, ellipses.B, ellipses.C, ellipses.determinant
+    grid = ellipses.grid
     reach = (ellipses.opacity * 255.0).log_().mul_(2.0 * 1.0005).add_(1e-3)
     over_A = A.reciprocal()
     half_height = (reach * A * determinant).sqrt_().add_(0.01)
@@ -183,14 +186,10 @@ def _spread(counts: Int32[Tensor, " k"]) -> tuple[Int32[Tensor, " m"], Int32[Ten
 
 
 def list_cells(
-    ellipses: Ellipses,
-    strips: Strips,
-    run: tuple[int, int],
-    grid: CellGrid,
-    alive: Bool[Tensor, " cells"] | None = None,
+    ellipses: Ellipses, strips: Strips, run: tuple[int, int], alive: Bool[Tensor, " cells"] | None = None
 ) -> CellLists:
     """The lists of one run of Gaussians; cells that are no longer `alive` (opaque already) get empty lists."""
-    begin, end = run
+    (begin, end), grid = run, ellipses.grid
     owner, first, number = _spread(strips.rows[begin:end])
     owner = owner.int() + begin if begin else owner.int()
 

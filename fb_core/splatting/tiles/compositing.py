@@ -61,7 +61,6 @@ def composite(
     opacities: Float[Tensor, "c n"],
     values: Float[Tensor, "v d"],
     ellipses: Ellipses,
-    grid: CellGrid,
     settings: CompositingSettings,
 ) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
     """Images of the values, and alpha = 1 - transmittance.
@@ -71,7 +70,7 @@ def composite(
     """
     if not (torch.is_grad_enabled() and any(t.requires_grad for t in (means2d, conics, opacities, values))):
         settings = replace(settings, kept_pairs=0)
-    return _Composite.apply(means2d, conics, opacities, values, ellipses, grid, settings)
+    return _Composite.apply(means2d, conics, opacities, values, ellipses, settings)
 
 
 def _forward_block(block: Block, image: Tensor) -> None:
@@ -79,25 +78,47 @@ def _forward_block(block: Block, image: Tensor) -> None:
     image[: block.weights.shape[1]].baddbmm_(block.values.permute(1, 2, 0), block.weights.permute(1, 0, 2))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Pixels:
+    """The pixels of some cells on the way from back to front."""
+
+    upstream: Float[Tensor, "s d1 p"]
+    """Gradient of the loss by the composited values and alpha."""
+    behind: Float[Tensor, "s p"]
+    """What is seen behind a block, times `upstream`; a block brings it to what is seen of it."""
+    light: Float[Tensor, "s p"]
+    """The transmittance behind a block; a block brings it to the one in front."""
+
+    def of(self, cells: Int32[Tensor, " s"]) -> _Pixels:
+        """Copies for a stretch of cells."""
+        return _Pixels(
+            upstream=self.upstream.index_select(0, cells),
+            behind=self.behind.index_select(0, cells),
+            light=self.light.index_select(0, cells),
+        )
+
+    def put(self, cells: Int32[Tensor, " s"], walked: _Pixels) -> None:
+        """What walking a stretch has left."""
+        self.behind.index_copy_(0, cells, walked.behind)
+        self.light.index_copy_(0, cells, walked.light)
+
+
 def _backward_block(
-    block: Block, monomials: Tensor, upstream: Tensor, behind: Tensor, light: Tensor, out: Float[Tensor, "bs r"],
-    absgrad: bool,
-    scratch: Scratch,
-) -> None:  # fmt: skip
-    """Gradients of the block's rows. `behind` [s, p] is brought from what is seen behind the block to what is seen of
-    it, and `light` from the transmittance behind it to the one in front.
+    block: Block, monomials: Tensor, pixels: _Pixels, out: Float[Tensor, "bs r"], absgrad: bool, scratch: Scratch
+) -> None:
+    """Gradients of the block's rows; brings `pixels` from behind the block to in front of it.
 
     The columns of `out`: six moments of g (`_central_moments`), two absolute pulls (with absgrad), the values, padding.
     """
-    depth, width, pixels = block.weights.shape
-    upstream, behind, light = upstream[:width], behind[:width], light[:width]
+    depth, width, each = block.weights.shape
+    upstream, behind, light = pixels.upstream[:width], pixels.behind[:width], pixels.light[:width]
     v_values = out[:, PULLS : PULLS + upstream.shape[1] - 1].view(depth, width, -1)
     v_values.copy_(torch.bmm(upstream[:, :-1], block.weights.permute(1, 2, 0)).permute(2, 0, 1))
-    torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, pixels))
+    torch.bmm(block.values.permute(1, 0, 2), upstream, out=scratch.take("seen", width, depth, each))
     g = _slopes(block.weights, behind, light, scratch)
     if block.capped is not None:
         g.masked_fill_(block.capped, 0.0)
-    g = g.view(depth * width, pixels)
+    g = g.view(depth * width, each)
     columns, local = scratch.take("moments", PULLS, depth * width), scratch.take("local", TERMS, depth * width)
     _central_moments(block.columns[1:3], torch.mm(monomials, g.t(), out=local), columns[:TERMS])
     if absgrad:
@@ -155,20 +176,25 @@ def _add_rows(sums: Float[Tensor, "v r"], splats: Int32[Tensor, " m"], rows: Flo
     sums.add_(F.embedding_bag(order, rows, counts.cumsum(0) - counts, mode="sum"))
 
 
-def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, light: Tensor | None) -> CellLists:
+def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Tensor | None) -> CellLists:
     """The lists of one slab, without the cells that the slabs before have made opaque."""
     alive = None if light is None else light[0].amax(dim=1) > TRANSMITTANCE_MIN
-    return list_cells(ellipses, strips, run, grid, alive)
+    return list_cells(ellipses, strips, run, alive)
 
 
 def _walk(
-    table: Table, ellipses: Ellipses, strips: Strips, run: tuple[int, int], grid: CellGrid, start: Tensor | None,
-    settings: CompositingSettings, scratch: Scratch,
-) -> list[Stretch]:  # fmt: skip
+    table: Table,
+    ellipses: Ellipses,
+    strips: Strips,
+    run: tuple[int, int],
+    start: Tensor | None,
+    settings: CompositingSettings,
+    scratch: Scratch,
+) -> list[Stretch]:
     """The stretches of one slab, walked once more for where their blocks are."""
     pixels = table.monomials.shape[1]
-    light = table.rows.new_ones(2, grid.count, pixels) if start is None else start.clone()
-    lists, walked, keep = _lists(ellipses, strips, run, grid, start), [], settings.kept_pairs
+    light = table.rows.new_ones(2, ellipses.grid.count, pixels) if start is None else start.clone()
+    lists, walked, keep = _lists(ellipses, strips, run, start), [], settings.kept_pairs
     for stretch in march(lists, pixels, settings.pairs_per_block):
         for _ in stretch.blocks(table, lists.splats, light, scratch, settings.pairs_per_block, keep):
             pass
@@ -239,20 +265,12 @@ def gradients_of(
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx,
-        means2d,
-        conics,
-        opacities,
-        values,
-        ellipses: Ellipses,
-        grid: CellGrid,
-        settings: CompositingSettings,
-    ):
+    def forward(ctx, means2d, conics, opacities, values, ellipses: Ellipses, settings: CompositingSettings):
+        grid = ellipses.grid
         with single_thread():
             table, strips, scratch = (
-                table_of(ellipses, values, grid, settings.alpha_cap),
-                measure_strips(ellipses, grid),
+                table_of(ellipses, values, settings.alpha_cap),
+                measure_strips(ellipses),
                 Scratch(values),
             )
             pixels = table.monomials.shape[1]
@@ -265,7 +283,7 @@ class _Composite(torch.autograd.Function):
                 starts.append((run, light.clone() if run[0] else None))
                 walked.clear()
                 keep = settings.kept_pairs
-                lists = _lists(ellipses, strips, run, grid, starts[-1][1])
+                lists = _lists(ellipses, strips, run, starts[-1][1])
                 for stretch in march(lists, pixels, settings.pairs_per_block):
                     local = image.new_zeros(stretch.cells.shape[0], *image.shape[1:])
                     for block in stretch.blocks(table, lists.splats, light, scratch, settings.pairs_per_block, keep):
@@ -275,7 +293,7 @@ class _Composite(torch.autograd.Function):
                     walked.append(stretch)
             colors, alphas = to_image(image[:, :-1], grid), to_image(image[:, -1:], grid)
         ctx.save_for_backward(means2d, conics, opacities, values)
-        ctx.ellipses, ctx.strips, ctx.grid, ctx.settings = ellipses, strips, grid, settings
+        ctx.ellipses, ctx.strips, ctx.settings = ellipses, strips, settings
         ctx.table, ctx.scratch, ctx.walked, ctx.starts, ctx.light = table, scratch, walked, starts, light[1]
         return colors, alphas
 
@@ -283,16 +301,17 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_colors, v_alphas):
         means2d, conics, opacities, values = ctx.saved_tensors
-        ellipses, grid, settings = ctx.ellipses, ctx.grid, ctx.settings
+        ellipses, grid, settings = ctx.ellipses, ctx.ellipses.grid, ctx.settings
         with single_thread():
             table, scratch = ctx.table, ctx.scratch
             upstream = to_cells([v_colors, v_alphas], grid)
-            behind, light = upstream.new_zeros(grid.count, upstream.shape[2]), ctx.light.clone()
+            behind = upstream.new_zeros(grid.count, upstream.shape[2])
+            pixels = _Pixels(upstream=upstream, behind=behind, light=ctx.light.clone())
             channels = values.shape[1]
             sums = values.new_zeros(values.shape[0], padded(PULLS + channels))
             for number, (run, start) in reversed(list(enumerate(ctx.starts))):
                 last = number == len(ctx.starts) - 1
-                walked = ctx.walked if last else _walk(table, ellipses, ctx.strips, run, grid, start, settings, scratch)
+                walked = ctx.walked if last else _walk(table, ellipses, ctx.strips, run, start, settings, scratch)
                 steps = [step.splats for stretch in walked for step in stretch.steps]
                 if not steps:
                     continue  # what was chosen reaches no pixel
@@ -300,19 +319,14 @@ class _Composite(torch.autograd.Function):
                 rows = values.new_empty(splats.shape[0], sums.shape[1])
                 end = rows.shape[0]
                 for stretch in reversed(walked):
-                    arriving, hidden, local = (
-                        part.index_select(0, stretch.cells) for part in (upstream, behind, light)
-                    )
+                    local = pixels.of(stretch.cells)
                     for block in stretch.blocks_again(table, scratch):
                         begin = end - block.splats.shape[0]
-                        _backward_block(
-                            block, table.monomials, arriving, hidden, local, rows[begin:end], settings.absgrad, scratch
-                        )
+                        _backward_block(block, table.monomials, local, rows[begin:end], settings.absgrad, scratch)
                         end = begin
-                    behind.index_copy_(0, stretch.cells, hidden)
-                    light.index_copy_(0, stretch.cells, local)
+                    pixels.put(stretch.cells, local)
                 _add_rows(sums, splats, rows)
             v_means2d, v_conics, v_opacities = gradients_of(
                 sums, means2d, conics, opacities, ellipses, settings.absgrad
             )
-        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None, None
+        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None

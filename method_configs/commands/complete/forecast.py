@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fb_core.completion.duration import expected_seconds, seconds_of_products
+from fb_core.completion.duration import SquareSequence, expected_seconds, seconds_of_products
 from fb_core.data.photos.photo import Photo
 from fb_core.geometry.features.pairs import FEATURES, pairs_at_most
 from fb_core.inpainter import Fillerbuster, SamplingConfig
@@ -98,13 +98,11 @@ def _seconds_of_features(looked_at: Sequence[float], stored: Sequence[float]) ->
 
 def _seconds_of_raymaps(model: Fillerbuster, count: int, sampling: SamplingConfig) -> float:
     together = min(count, POSES_AT_ONCE)
-    once = expected_seconds(
-        model, views=together, known=together, side=model.size, sampling=sampling, recovers_rays=True
-    )
-    return count / together * once
+    window = SquareSequence(views=together, known=together, side=model.size, recovers_rays=True)
+    return count / together * expected_seconds(model, window, sampling)
 
 
 def _seconds_of_pass(model: Fillerbuster, plan: Plan, number: int) -> float:
     new = len(plan.passes.views[number])
     known = plan.photos + (plan.passes.anchors if number else 0)
-    return expected_seconds(model, views=known + new, known=known, side=plan.side, sampling=plan.sampling)
+    return expected_seconds(model, SquareSequence(views=known + new, known=known, side=plan.side), plan.sampling)

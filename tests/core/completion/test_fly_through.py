@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fb_core.completion import duration, fly_through
-from fb_core.completion.duration import expected_seconds
+from fb_core.completion.duration import SquareSequence, expected_seconds
 from fb_core.completion.fly_through import choose_context, find_cameras, generate, plan_passes, room_beside
 from fb_core.data.photos.photo import Photo
 from fb_core.evaluation.self_consistency import photo_of
@@ -211,7 +211,8 @@ def test_photos_are_cut_to_their_central_square_with_the_camera_of_that_square(m
 
 def test_more_work_is_expected_to_take_longer(model):
     def seconds(views: int = 8, side: int = 32, **options) -> float:
-        return expected_seconds(model, views=views, known=2, side=side, sampling=dataclasses.replace(FEW, **options))
+        sequence = SquareSequence(views=views, known=2, side=side)
+        return expected_seconds(model, sequence, dataclasses.replace(FEW, **options))
 
     once = seconds()
     assert once > 0

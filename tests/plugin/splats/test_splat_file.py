@@ -18,6 +18,7 @@ from fb_core.geometry.viewpoints.coverage import Coverage
 from fb_core.geometry.viewpoints.paths import CaptureShape
 from fb_nerfstudio.splats.scene_film import film_frame, seen_by_photos
 from fb_nerfstudio.splats.splat_file import Splats, read_splats, write_splats
+from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.scenes.scene_budget import SceneBudget, Speed
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -175,16 +176,16 @@ def test_more_time_never_makes_less_and_what_is_given_is_kept() -> None:
     speed = Speed(step=2e-6, frame=1.5e-6, whole_step=0.02)
 
     def budget(seconds: float, **given: int) -> SceneBudget:
-        return SceneBudget.of(seconds, speed, frames=32, longest=1920, aspect=9 / 16, device="cpu", **given)
+        return SceneBudget.of(seconds, speed, CompleteOptions(views=32, **given), photos=(1920, 1080), device="cpu")
 
     several = [budget(seconds) for seconds in (1, 30, 120, 300, 1200, 10000)]
     for less, more in itertools.pairwise(several):
         assert less.photo_side <= more.photo_side <= 1920 and less.film_side <= more.film_side <= 1920
     for seconds, one in zip((120, 300, 1200, 10000), several[2:], strict=True):
         assert one.seconds <= seconds
-    small = SceneBudget.of(100, speed, frames=1, longest=32, aspect=1.0, device="cpu")
+    small = SceneBudget.of(100, speed, CompleteOptions(views=1), photos=(32, 32), device="cpu")
     assert small.schedule.steps * speed.whole_step <= small.seconds <= 100  # a step has its price on any picture
-    strip = SceneBudget.of(1, speed, frames=1, longest=2000, aspect=0.1, device="cpu")
+    strip = SceneBudget.of(1, speed, CompleteOptions(views=1), photos=(200, 2000), device="cpu")
     assert int(strip.photo_side * 0.1) >= 16  # what is trained on has 16 pixels at least
-    given = budget(300, steps=12, photo_side=100, film_side=5000)
+    given = budget(300, iterations=12, photo_size=100, film_size=5000)
     assert (given.schedule.steps, given.photo_side, given.film_side) == (12, 100, 1920)

@@ -199,7 +199,6 @@ def announcement(job: SceneJob, budget: SceneBudget) -> str:
 def _budget(job: SceneJob, seconds: float) -> SceneBudget:
     """Decided once, and kept: a command that goes on does not decide anew."""
     kept = job.work / "scene.json"
-    options, (width, height) = job.options, job.common_size
     if kept.is_file():
         told = read_json(kept)
         speed, seconds = Speed(**told["speed"]), float(told["seconds"])
@@ -209,17 +208,7 @@ def _budget(job: SceneJob, seconds: float) -> SceneBudget:
             unfinished.write_text(
                 json.dumps({"speed": dataclasses.asdict(speed), "seconds": seconds}), encoding="utf-8"
             )
-    return SceneBudget.of(
-        seconds,
-        speed,
-        frames=options.views,
-        longest=max(width, height),
-        aspect=min(width, height) / max(width, height),
-        device=job.device,
-        steps=options.iterations,
-        photo_side=options.photo_size,
-        film_side=options.film_size,
-    )
+    return SceneBudget.of(seconds, speed, job.options, photos=job.common_size, device=job.device)
 
 
 def _capture_to_train(job: SceneJob, side: int) -> Capture:

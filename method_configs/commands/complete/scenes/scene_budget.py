@@ -12,6 +12,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.scene_film import film_frame
 from fb_nerfstudio.splats.splat_file import Splats
+from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.scenes.scene_training import SceneSchedule
 
 _COMPLETE_AT = 500  # as ns-train fillerbuster
@@ -57,38 +58,31 @@ class SceneBudget:
     def of(
         seconds: float,
         speed: Speed,
+        options: CompleteOptions,
         *,
-        frames: int,
-        longest: int,
-        aspect: float,
+        photos: tuple[int, int],
         device: str,
-        steps: int | None = None,
-        photo_side: int | None = None,
-        film_side: int | None = None,
     ) -> SceneBudget:
         """What fits into a time.
 
         Args:
             seconds: that are left.
             speed: of the machine.
-            frames: of the film.
-            longest: side of the photos in pixels, which nothing exceeds.
-            aspect: of a picture's shorter side to its longer one, from 0 to 1.
+            options: pictures of the film; steps and sides, where they are given.
+            photos: width and height of the photos in pixels; their longer side is one that nothing exceeds.
             device: where splats are trained.
-            steps: of the training, where they are given.
-            photo_side: of the photos, where it is given.
-            film_side: of the film, where it is given.
         """
         seconds = max(seconds, _LEAST_SECONDS)
+        steps, longest, aspect = options.iterations, max(photos), min(photos) / max(photos)
         wanted = _WANTED_STEPS if steps is None else steps
 
         def training(side: int, steps: int) -> float:
             return steps * (speed.whole_step + speed.step * aspect * side**2)
 
         def film(side: int) -> float:
-            return frames * speed.frame * aspect * side**2
+            return options.views * speed.frame * aspect * side**2
 
-        side = photo_side or max(
+        side = options.photo_size or max(
             [one for one in _SIDES if one < longest and training(one, wanted) <= _TRAINING_SHARE * seconds]
             or [_SIDES[0]]
         )
@@ -97,7 +91,7 @@ class SceneBudget:
             affordable = _TRAINING_SHARE * seconds / max(training(side, 1), 1e-9)
             steps = int(min(max(affordable, FEWEST_STEPS), MOST_STEPS)) // 10 * 10
         # Splats know no more than the photos that they were trained on: beyond twice that size a film only gets larger.
-        film_side = film_side or max(
+        film_side = options.film_size or max(
             [one for one in _SIDES if one <= 2 * side and film(one) <= _FILM_SHARE * seconds] or [_SIDES[0]]
         )
         film_side = min(film_side, longest)
