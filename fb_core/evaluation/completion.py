@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.completion.samples import likeliest
 from fb_core.data.rooms.ray_caster import render
 from fb_core.data.rooms.room import FAMILIES, Room, make_room, require_family
 from fb_core.data.rooms.room_cameras import training_cameras
@@ -167,6 +168,11 @@ def mean_of(samples: int) -> str:
     return f"mean of {samples} samples"
 
 
+def likeliest_of(samples: int) -> str:
+    """The name of what is made of several samples: in every neighbourhood the one nearest to their mean."""
+    return f"likeliest of {samples} samples"
+
+
 def evaluate_completion(
     model: Fillerbuster,
     task: CompletionTask,
@@ -180,11 +186,12 @@ def evaluate_completion(
     """Complete one unseen room after the other, from noise and at each of the strengths from re-projections; yields
     each result.
 
-    With several ``samples`` their mean is scored, too; with ``told`` the model that is told what is carried over, which
-    is then what is shown as completed. ``sampling`` None is what the model's folder recommends.
+    With several ``samples`` their mean and the likeliest of them are scored, too; with ``told`` the model that is told
+    what is carried over, which is then what is shown as completed. ``sampling`` None is what the model's folder
+    recommends.
     """
     sampling = model.recommended_sampling if sampling is None else sampling
-    averaged = (mean_of(samples),) if samples > 1 else ()
+    averaged = (mean_of(samples), likeliest_of(samples)) if samples > 1 else ()
     for number in range(task.rooms):
         room = unseen_room(family=task.family, seed=task.seed, number=number, views=task.views, size=model.size)
         given, hidden = room[: task.known], room[task.known :]
@@ -202,11 +209,13 @@ def evaluate_completion(
             )
         if averaged:
             others = [_OTHER_SAMPLE * other + seed for other in range(1, samples)]
-            drawn = [
-                completed,
-                *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others),
-            ]
-            answers[mean_of(samples)] = torch.stack(drawn).mean(dim=0)
+            drawn = torch.stack(
+                [
+                    completed,
+                    *(complete_hidden(model, given, hidden.cameras, sampling, seed=other) for other in others),
+                ]
+            )
+            answers[mean_of(samples)], answers[likeliest_of(samples)] = drawn.mean(dim=0), likeliest(drawn)
         methods = (*METHODS, *map(started_at, strengths), *((TOLD,) if told else ()), *averaged)
         errors = {name: float(psnr(answers[name], hidden.images).mean()) for name in methods}
         edges = {name: edge_energy(answers[name], hidden.images) for name in methods}

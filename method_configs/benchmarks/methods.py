@@ -23,7 +23,7 @@ from fb_core.files.whole import whole_file, whole_folder
 from fb_core.machine.resources import usable_cores
 from fb_nerfstudio.runs.earlier_runs import clear_run
 from fb_nerfstudio.runs.training_process import TrainingProcess
-from method_configs.room_runs import FAMILY, run_folder, training_arguments
+from method_configs.room_runs import run_folder, training_arguments
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -58,6 +58,8 @@ class Methods:
     """Their side in pixels."""
     held_out: int = 16
     """Held-out pictures, half of them covered by the capture."""
+    family: Literal["narrow", "medium", "wide"] = "narrow"
+    """How varied the rooms are; the bundled model knows narrow ones."""
     block: float = 0.35
     """Side of the block that is cut out, as a part of the picture's."""
     block_in: Literal["picture", "world"] = "picture"
@@ -95,7 +97,8 @@ def run_methods(config: Methods) -> Report:
     rows: list[dict[str, Any]] = []
     for room in config.rooms:
         masked = "masked" if config.block_in == "picture" else "masked-in-world"
-        plain, cut = config.output / f"room-{room}", config.output / f"room-{room}-{masked}"
+        name = f"room-{room}" if config.family == "narrow" else f"{config.family}-room-{room}"
+        plain, cut = config.output / name, config.output / f"{name}-{masked}"
         make_captures(plain / "capture", cut / "capture", room, config)
         rows += [_measured("new views", method, room, plain, config) for method in config.new_views]
         rows += [_measured("masked", method, room, cut, config) for method in config.masked]
@@ -107,7 +110,7 @@ def make_captures(plain: Path, cut: Path, room: int, config: Methods) -> None:
     from fb_core.data.rooms.room_captures import rooms
 
     if not plain.exists():
-        rooms(room, plain, family=FAMILY, views=config.views, size=config.size, held_out=config.held_out)
+        rooms(room, plain, family=config.family, views=config.views, size=config.size, held_out=config.held_out)
     if not cut.exists():
         cut_blocks(plain, cut, share=config.block, block_in=config.block_in)
 

@@ -4,6 +4,7 @@ sheet.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,14 +32,14 @@ class Rooms:
     """How varied room and cameras are; the bundled model knows narrow rooms."""
     guidance: tuple[float, ...] = ()
     """Guidance scales of unknown content to try; by default the model's own."""
+    steps: tuple[int, ...] = ()
+    """Numbers of denoising steps to try; by default the model's own."""
     strengths: tuple[float, ...] = (0.7,)
     """Strengths at which the model also starts from the pixels carried over by direction, instead of from noise; none
     to leave it out.
     """
     samples: int = 4
     """Samples whose mean is scored, too; 1 to leave it out."""
-    told: bool | None = None
-    """Also tell the model what is carried over, as a guess; by default if it was trained to be told."""
     seed: int = 0
     """Decides rooms, cameras and samples."""
     json: Path | None = None
@@ -47,8 +48,9 @@ class Rooms:
     """Draw the first rooms into this PNG."""
 
     def run(self) -> None:
-        """Complete the same unseen rooms at every guidance scale and report. Raises ValueError for strengths beyond 0
-        to 1, and for no samples.
+        """Complete the same unseen rooms at every guidance scale, with every number of steps, and report.
+
+        Raises ValueError for strengths beyond 0 to 1, and for no samples.
         """
         import dataclasses
 
@@ -59,6 +61,7 @@ class Rooms:
             CompletionTask,
             RoomResult,
             evaluate_completion,
+            likeliest_of,
             mean_of,
             started_at,
             summary,
@@ -73,19 +76,22 @@ class Rooms:
         completer = Fillerbuster.from_pretrained(self.model)
         task = CompletionTask(rooms=self.rooms, views=self.views, known=self.known, family=self.family, seed=self.seed)
         recommended = completer.recommended_sampling
-        told = recommended.guess != "start" if self.told is None else self.told
+        told = recommended.guess != "start"  # a model that was trained to be told a guess also is
         report, results = Report(seed=self.seed), list[RoomResult]()
-        for scale in self.guidance or (recommended.guidance_unknown,):
-            sampling = dataclasses.replace(recommended, guidance_unknown=scale)
+        for scale, steps in itertools.product(
+            self.guidance or (recommended.guidance_unknown,), self.steps or (recommended.steps,)
+        ):
+            sampling = dataclasses.replace(recommended, guidance_unknown=scale, steps=steps)
             began = time.process_time()
             iterator = evaluate_completion(
                 completer, task, sampling, strengths=self.strengths, samples=self.samples, told=told
             )
-            results = list(track(iterator, description=f"guidance {scale:g}", total=self.rooms, transient=True))
+            results = list(
+                track(iterator, description=f"guidance {scale:g}, {steps} steps", total=self.rooms, transient=True)
+            )
             seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths) + told)
-            times = {"model": 1.0, TOLD: 1.0, mean_of(self.samples): 1.0} | {
-                started_at(strength): strength for strength in self.strengths
-            }
+            drawn = {mean_of(self.samples): 1.0, likeliest_of(self.samples): 1.0}
+            times = {"model": 1.0, TOLD: 1.0, **drawn} | {started_at(strength): strength for strength in self.strengths}
             mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds}
             for method, values in summary(results).items():
                 own = mine | {"strength": times[method]} if method in times else dict.fromkeys([*mine, "strength"], "-")

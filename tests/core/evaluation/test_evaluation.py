@@ -14,6 +14,7 @@ from fb_core.evaluation.completion import (
     baselines,
     evaluate_completion,
     mean_color,
+    likeliest_of,
     mean_of,
     nearest_known,
     started_at,
@@ -120,6 +121,8 @@ def test_the_mean_of_samples_is_scored_and_a_single_one_is_left_alone(tmp_path):
     assert result.psnr["model"] == alone.psnr["model"]
     assert mean_of(3) in result.psnr and mean_of(3) not in alone.psnr
     assert result.psnr[mean_of(3)] > result.psnr["model"]  # independent errors cancel
+    assert result.psnr["model"] < result.psnr[likeliest_of(3)] < result.psnr[mean_of(3)]
+    assert result.edges[likeliest_of(3)] > result.edges[mean_of(3)]
 
 
 def test_what_is_above_the_baseline_is_told_room_by_room():
