@@ -18,7 +18,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of
 from fb_core.geometry.features.lenses import LensGuess
-from fb_core.geometry.features.own_lens import LensTrial, Placed, lens_doubt, lens_trial, shared_doubt, sight_of
+from fb_core.geometry.features.own_lens import LensTrial, Placed, focal_doubt, lens_doubt, lens_trial, sight_of
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_through
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
 from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses, outlying, sigma_of
@@ -248,10 +248,12 @@ class Reconstruction:
         alone = self._copied(self.lenses.one_each())
         bundle, cameras, lenses, _ = alone._bundle(np.flatnonzero(alone.used))
         found = deviations_of(bundle, alone.lenses.known(lenses))
-        guessed = ~self.lenses.believed & ~self.lenses.fixed & (np.bincount(own) > 1)
+        told, shared = self.lenses.believed & (self.registered.sum() > 2), np.bincount(own) > 1
+        asked = ~self.lenses.fixed & (told | (shared & ~self.lenses.believed))  # of two photos, tags are all there is
         for camera, index in enumerate(cameras.tolist()):
-            if guessed[own[index]] and not self.photos[index].same_lens:
-                doubts[index] = doubts[index] or shared_doubt(float(found.focal[found.lens[camera]]))
+            if asked[own[index]] and not (self.photos[index].same_lens and shared[own[index]]):
+                deviation = float(found.focal[found.lens[camera]])
+                doubts[index] = doubts[index] or focal_doubt(deviation, told=bool(told[own[index]]))
         return doubts
 
     @property
