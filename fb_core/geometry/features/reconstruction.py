@@ -34,6 +34,7 @@ _LIE = 0.1  # logarithm of the focal length found over the one told, from which 
 _FOCAL_FACTORS = (1.0, 0.5, 0.7, 1.4, 2.0)
 
 _NO_PLACE = "the points that it shares with the others allow no camera with the focal length believed"
+_ALONE = "it can be placed only against other photos, and no camera of these can be trusted"
 _TWO_OF_THREE = "another photo shows the same points and fits no camera; which of the photos is wrong cannot be told"
 
 Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
@@ -304,6 +305,8 @@ class Reconstruction:
             else:
                 reason = outlying(relative[mine], sigma) or lens_doubts[index]
             reasons.append(reason or doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
+        if reasons.count("") == 1:  # cameras stand where they stand against one another
+            reasons[reasons.index("")] = _ALONE
         return FeatureCameras(
             cameras=cameras,
             trusted=[not reason for reason in reasons],
