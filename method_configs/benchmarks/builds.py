@@ -55,6 +55,10 @@ class Builds(TableFiles):
 
         if not (self.other / "fb_core").is_dir():
             raise ValueError(f"other: expected the root of a checkout, which holds fb_core, got {self.other}")
+        if self.keep is not None:
+            raise ValueError(
+                "keep: the builds are timed in turns in one run, of which nothing can be kept; leave it out"
+            )
         if self.rooms < 1 or self.threads < 1:
             raise ValueError(
                 f"bench builds: expected at least one room and one thread, got {self.rooms} and {self.threads}"

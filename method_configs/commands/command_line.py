@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import tyro
 
@@ -27,6 +27,7 @@ from method_configs.benchmarks.methods import Methods
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
+from method_configs.benchmarks.table_files import TableFiles
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.train_options import TrainOptions
 from method_configs.commands.typed_options import TypedCompleteOptions, TypedTrainOptions, looked_at
@@ -218,8 +219,7 @@ def bench(
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
-    _require_usable(benchmark)
-    benchmark.run()
+    _measure(benchmark)
 
 
 def evaluate(
@@ -239,8 +239,37 @@ def evaluate(
     ],
 ) -> None:
     """Measure how good a model is on unseen rooms, and a completed scene on photos that it was not given."""
-    _require_usable(evaluation)
-    evaluation.run()
+    _measure(evaluation)
+
+
+class _Measures(Protocol):
+    """What ``bench`` and ``eval`` run."""
+
+    def run(self) -> None:
+        """Measure and report."""
+        ...
+
+
+def _measure(command: _Measures) -> None:
+    """Measures; where Ctrl-C ends it, also within a training of a design, KeyboardInterrupt says what is kept."""
+    _require_usable(command)
+    try:
+        command.run()
+    except (KeyboardInterrupt, SystemExit) as error:
+        if isinstance(error, SystemExit) and error.code != ENDED_BY_USER:
+            raise
+        raise KeyboardInterrupt(_what_is_kept(command)) from error
+
+
+def _what_is_kept(command: _Measures) -> str:
+    begins_anew, goes_on = "Nothing was kept; ", "the same command goes on from there."
+    if isinstance(command, Methods | Paper | Ablations | Designs):
+        return f"What is whole is kept in {command.output}; {goes_on}"
+    if isinstance(command, Builds) or not isinstance(command, TableFiles):
+        return f"{begins_anew}the same command begins anew."
+    if command.keep is None:
+        return f"{begins_anew}with --keep FOLDER the same command goes on where it was."
+    return f"What was measured is kept in {command.keep}; {goes_on}"
 
 
 def _require_usable(command: object) -> None:
@@ -300,7 +329,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=None if arguments is None else list(arguments),
         )
     except KeyboardInterrupt as error:
-        _stop(error, "Stopped.", ENDED_BY_USER)
+        _stop(error, f"Stopped. {error}", ENDED_BY_USER)
     except (ValueError, FloatingPointError, OSError) as error:
         _stop(error, f"Error: {sentence_of(error)}", 1)
 

@@ -20,6 +20,12 @@ import pytest
 from helpers.tiny_models import save_tiny_model
 
 from fb_core.data.rooms.room_captures import rooms
+from fb_core.machine.interruption import signals_given_back
+from method_configs.benchmarks.poses.command import Poses
+from method_configs.entrance import main
+from method_configs.evaluations.designs.command import Designs
+from method_configs.evaluations.rooms import Rooms
+from method_configs.evaluations.trust import Trust
 
 ROOT = Path(__file__).resolve().parents[2]
 SIDE = 32
@@ -35,7 +41,11 @@ def hook(event, arguments):
         if left == 0:
             os.killpg(0, signal.SIGINT)
 from fb_core.machine import interruption
+from method_configs.benchmarks.poses.command import Poses
 from method_configs.entrance import main
+from method_configs.evaluations.designs.command import Designs
+from method_configs.evaluations.rooms import Rooms
+from method_configs.evaluations.trust import Trust
 sys.addaudithook(hook)
 main()
 """
@@ -110,6 +120,68 @@ def test_while_a_command_imports(name: str, number: int, inputs: tuple[Path, Pat
     assert out == ""
     assert_one_line(child.returncode, said)
     assert not list(tmp_path.iterdir())
+
+
+ANEW = "Nothing was kept; the same command begins anew."
+MEASURING: dict[str, tuple[type, list[str], str]] = {
+    "bench poses": (Poses, [], ANEW),
+    "eval rooms": (Rooms, [], ANEW),
+    "eval trust": (Trust, [], "Nothing was kept; with --keep FOLDER the same command goes on where it was."),
+    "eval trust --keep": (
+        Trust,
+        ["--keep", "kept"],
+        "What was measured is kept in kept; the same command goes on from there.",
+    ),
+    "eval designs": (
+        Designs,
+        ["--output", "kept", "--designs", "base", "--batches", "2"],
+        "What is whole is kept in kept; the same command goes on from there.",
+    ),
+}
+
+
+@pytest.mark.parametrize("moment", [0.02, 0.5])
+@pytest.mark.parametrize("name", MEASURING)
+def test_while_a_command_measures(
+    name: str, moment: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """In this process, after so much processor time: the line says whether the same command goes on."""
+    kind, options, kept = MEASURING[name]
+    run = kind.run
+
+    def begun(self: object) -> None:
+        signal.setitimer(signal.ITIMER_PROF, moment)
+        run(self)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(kind, "run", begun)
+    monkeypatch.setattr(sys, "argv", ["fillerbuster", *name.split()[:2], *options])
+    before = signal.signal(signal.SIGPROF, lambda number, frame: os.kill(os.getpid(), signal.SIGINT))
+    try:
+        with signals_given_back(), pytest.raises(SystemExit) as stopped:
+            main()
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+    said = capsys.readouterr().err
+    assert_one_line(stopped.value.code, said)
+    assert said.rstrip().splitlines()[-1] == f"Stopped. {kept}", said
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")], "half written"
+
+
+def test_a_training_within_a_measurement_hands_the_interruption_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A design's training saves its step and ends with a code alone, after which nothing was said."""
+
+    def stopped_in_training(self: object) -> None:
+        raise SystemExit(128 + signal.SIGINT)
+
+    monkeypatch.setattr(Designs, "run", stopped_in_training)
+    monkeypatch.setattr(sys, "argv", ["fillerbuster", "eval", "designs"])
+    with signals_given_back(), pytest.raises(SystemExit) as stopped:
+        main()
+    assert_one_line(stopped.value.code, capsys.readouterr().err)
 
 
 @pytest.mark.slow

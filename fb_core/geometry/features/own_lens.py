@@ -169,12 +169,14 @@ def lens_doubt(trial: LensTrial, focal: float) -> str:
     return ""
 
 
-def shared_doubt(deviation: float) -> str:
-    """What speaks against a photo of which nothing but its size says that it shares its lens, given how well it would
-    tell a focal length of its own (relative deviation); empty if nothing does.
+def focal_doubt(deviation: float, *, told: bool) -> str:
+    """What speaks against a photo of whose focal length only its size, or one tag that nothing else bears out (`told`),
+    says something, given how well its features would tell it (relative deviation); empty if nothing does.
     """
     if deviation <= FOCAL_GUESSED / 2:
         return ""
+    if told:
+        return "only a tag tells its focal length: its features can hardly tell zoom from distance, and tags may lie"
     return "nothing says whether it was zoomed: its features tell hardly anything of its focal length, and no tag does"
 
 

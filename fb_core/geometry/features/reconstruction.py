@@ -18,7 +18,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of
 from fb_core.geometry.features.lenses import LensGuess
-from fb_core.geometry.features.own_lens import LensTrial, Placed, lens_doubt, lens_trial, shared_doubt, sight_of
+from fb_core.geometry.features.own_lens import LensTrial, Placed, focal_doubt, lens_doubt, lens_trial, sight_of
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_through
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
 from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses, outlying, sigma_of
@@ -34,6 +34,7 @@ _LIE = 0.1  # logarithm of the focal length found over the one told, from which 
 _FOCAL_FACTORS = (1.0, 0.5, 0.7, 1.4, 2.0)
 
 _NO_PLACE = "the points that it shares with the others allow no camera with the focal length believed"
+_ALONE = "it can be placed only against other photos, and no camera of these can be trusted"
 _TWO_OF_THREE = "another photo shows the same points and fits no camera; which of the photos is wrong cannot be told"
 
 Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
@@ -248,10 +249,12 @@ class Reconstruction:
         alone = self._copied(self.lenses.one_each())
         bundle, cameras, lenses, _ = alone._bundle(np.flatnonzero(alone.used))
         found = deviations_of(bundle, alone.lenses.known(lenses))
-        guessed = ~self.lenses.believed & ~self.lenses.fixed & (np.bincount(own) > 1)
+        told, shared = self.lenses.believed & (self.registered.sum() > 2), np.bincount(own) > 1
+        asked = ~self.lenses.fixed & (told | (shared & ~self.lenses.believed))  # of two photos, tags are all there is
         for camera, index in enumerate(cameras.tolist()):
-            if guessed[own[index]] and not self.photos[index].same_lens:
-                doubts[index] = doubts[index] or shared_doubt(float(found.focal[found.lens[camera]]))
+            if asked[own[index]] and not (self.photos[index].same_lens and shared[own[index]]):
+                deviation = float(found.focal[found.lens[camera]])
+                doubts[index] = doubts[index] or focal_doubt(deviation, told=bool(told[own[index]]))
         return doubts
 
     @property
@@ -302,6 +305,8 @@ class Reconstruction:
             else:
                 reason = outlying(relative[mine], sigma) or lens_doubts[index]
             reasons.append(reason or doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
+        if reasons.count("") == 1:  # cameras stand where they stand against one another
+            reasons[reasons.index("")] = _ALONE
         return FeatureCameras(
             cameras=cameras,
             trusted=[not reason for reason in reasons],

@@ -119,6 +119,36 @@ def test_a_zoomed_photo_that_nothing_else_confirms_makes_a_pair_of_three_doubtfu
     assert not false_oks(found, views)
 
 
+def test_three_photos_of_a_wall_by_three_lenses_tell_of_none():
+    """One lens explains them to a twentieth of a pixel, from other places: two homographies are fewer numbers than
+    three cameras with a focal length each.
+    """
+    views, points = wall_views(3)
+    found = chain(photos_of(zoomed(views, [0.6, 1.0, 1.5]), points, noise=0.1))
+    assert not any(found.trusted) and all(found.reasons), found.reasons
+
+
+@pytest.mark.parametrize(("same_lens", "ok"), [(False, [0, 1, 3, 4]), (True, [0, 1, 2, 3, 4])])
+def test_a_tag_that_nothing_bears_out_is_believed_of_no_photo_that_looks_straight_at_a_wall(
+    same_lens: bool, ok: list[int]
+):
+    """Photo 2 was zoomed, or not: its features cannot tell, and its tag is one witness. The device's lens and size,
+    which other photos have too, bear it out.
+    """
+    views, points = wall_views(5)
+    truth = views if same_lens else zoomed(views, [1.0, 1.0, 0.6, 1.0, 1.0])
+    photos = photos_of(truth, points, told=500.0, noise=0.1)
+    found = chain([dataclasses.replace(photo, same_lens=same_lens) for photo in photos])
+    assert [index for index, trusted in enumerate(found.trusted) if trusted] == ok, found.reasons
+    assert not false_oks(found, truth)
+
+
+def test_of_two_photos_tags_are_believed():
+    """Two views tell no focal length at all, so that nothing bears tags out, and nothing else can be had."""
+    truth = around(2, arc_degrees=20.0)
+    assert chain(photos_of(truth, cloud(120), told=500.0)).trusted == [True, True]
+
+
 @pytest.mark.parametrize("bend", [(-0.25, 0.05), (-0.1, 0.0), (0.08, 0.0)])
 def test_a_lens_that_bends_is_found_and_its_focal_length_is_right(bend: tuple[float, float]):
     truth = around(5, focal=430.0, arc_degrees=60.0)
