@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from fb_core.evaluation.metrics.correspondences import Matcher
     from fb_core.evaluation.metrics.relative_rotation import PairResult
     from fb_core.geometry.cameras import Pinholes
+    from method_configs.evaluations.true_films import Film
 
-TRUE_FILM = "rendered exactly"
-"""Row of the procedural room itself along the same path: what the matcher can reach there."""
 _CURVE_DEGREES = 30.0
 
 
@@ -49,7 +48,10 @@ class Consistency(TableFiles):
     loftr: Path | None = None
     """kornia's weights loftr_outdoor.ckpt (the paper's matcher); without them correspondences are SIFT features."""
     true_film: bool = True
-    """For captures of procedural rooms also judge the room itself, rendered exactly along the same path."""
+    """Also judge what is true: a procedural room rendered exactly along the same path, or another capture's photos."""
+    controls: bool = False
+    """Also judge what the metric is worth: a room with paint on its blank walls, and that or the photos spoilt (cameras
+    shuffled, blurred, frames that disagree)."""
 
     def run(self) -> None:
         """Render the frames that are needed, judge them, report."""
@@ -63,12 +65,12 @@ class Consistency(TableFiles):
         judged: dict[tuple[str, str], list[PairResult]] = {}
         part = f"RRA: {self.pairs} pairs within a second of {self.fps:g} frames, {self._matcher}, {self.size} pixels"
         for run in self.runs:
-            found = self._judged(run, matcher)
+            found = self._judged(run, matcher, {capture for _, capture in judged})
             for method, pairs in found["pairs"].items():
                 key = (method, found["capture"])
-                if key not in judged:  # several runs on one room share its true film
+                if key not in judged:  # of two runs of one method on one capture the first is told
                     judged[key] = [PairResult(**values) for values in pairs]
-                    model = "-" if method == TRUE_FILM else found["model"]
+                    model = found["model"] if method == found["method"] else "-"
                     report.rows.append(
                         {"part": part, "method": method, "capture": key[1], "model": model} | accuracy(judged[key])
                     )
@@ -90,39 +92,45 @@ class Consistency(TableFiles):
                 f"got seconds {self.seconds:g}, fps {self.fps:g}, size {self.size}, pairs {self.pairs}"
             )
 
-    def _judged(self, run: Path, matcher: Matcher) -> dict[str, Any]:
-        """``pairs`` of each method as plain values (the run's and the true film's), the ``capture``'s name, the
-        ``model``'s hash.
+    def _judged(self, run: Path, matcher: Matcher, told: set[str]) -> dict[str, Any]:
+        """``pairs`` of each film as plain values, the run's ``method``, its ``capture``'s name, its ``model``'s hash.
+
+        Args:
+            run: its folder.
+            matcher: finds correspondences.
+            told: captures whose true film an earlier run of this command has brought.
         """
         from fb_nerfstudio.runs.finished_run import capture_of, identity_of, read_run
 
         config, state = read_run(run)
-        capture = capture_of(config)
-        options = ("seed", "path", "seconds", "fps", "pairs", "size", "fov", "true_film")
+        capture, method = capture_of(config), config.method_name
+        name = scene_name(capture)
+        with_truth = self.true_film and name not in told
+        options = ("seed", "path", "seconds", "fps", "pairs", "size", "fov", "controls")
         asked = (
-            {name: getattr(self, name) for name in options}
+            {option: getattr(self, option) for option in options}
             | identity_of(run, state)
-            | {"matcher": str(self.loftr or "SIFT")}
+            | {"matcher": str(self.loftr or "SIFT"), "true_film": with_truth}
         )
         del state
-        name = scene_name(capture)
-        file = f"{config.method_name}-{name}-{_digest(asked['run'])}"
-        return self.kept(
-            file, asked, lambda: self._measured(run, config.method_name, capture, matcher) | {"capture": name}
-        )
+        file = f"{method}-{name}-{_digest(asked['run'])}"
+        found = self.kept(file, asked, lambda: self._measured(run, method, capture, matcher, with_truth))
+        return found | {"capture": name, "method": method}
 
-    def _measured(self, run: Path, method: str, capture: Path, matcher: Matcher) -> dict[str, Any]:
+    def _measured(self, run: Path, method: str, capture: Path, matcher: Matcher, with_truth: bool) -> dict[str, Any]:
+        from fb_core.evaluation.metrics.relative_rotation import frame_pairs
         from fb_nerfstudio.runs.finished_run import load_run, quiet
+        from method_configs.evaluations.true_films import Film, true_films
 
         with quiet():
             pipeline = load_run(run)
             captured = captured_cameras(pipeline)
         cameras, bank = self.film(captured), pipeline.datamanager.generated_views
-        films = {method: rendered_by(pipeline, cameras)}
-        exact = true_pictures(capture, pipeline, captured, cameras) if self.true_film else None
-        if exact is not None:
-            films[TRUE_FILM] = exact
-        judged = {name: self._judge(pictures, cameras, matcher, f"{name}: pair") for name, pictures in films.items()}
+        pairs = frame_pairs(len(cameras), most_apart=max(1, round(self.fps)), count=self.pairs, seed=self.seed)
+        films = {method: Film(pictures=rendered_by(pipeline, cameras), cameras=cameras, pairs=pairs)}
+        if with_truth:
+            films |= true_films(capture, pipeline, captured, films[method], seed=self.seed, controls=self.controls)
+        judged = {name: self._judge(film, matcher, f"{name}: pair") for name, film in films.items()}
         return {
             "pairs": {name: [dataclasses.asdict(pair) for pair in found] for name, found in judged.items()},
             "model": "-" if bank is None or not len(bank) else bank.origins[0].model_hash[:8],
@@ -139,19 +147,20 @@ class Consistency(TableFiles):
             self.path, captured, max(2, round(self.seconds * self.fps)), size=self.size, fov_degrees=self.fov
         )
 
-    def _judge(
-        self, pictures: Callable[[int], Tensor], cameras: Pinholes, matcher: Matcher, what: str
-    ) -> list[PairResult]:
+    def _judge(self, film: Film, matcher: Matcher, what: str) -> list[PairResult]:
         import torch
         from rich.progress import Progress
 
-        from fb_core.evaluation.metrics.relative_rotation import frame_pairs, judge_pairs
+        from fb_core.evaluation.metrics.relative_rotation import judge_pairs
 
-        chosen = frame_pairs(len(cameras), most_apart=max(1, round(self.fps)), count=self.pairs, seed=self.seed)
         with Progress(transient=True) as bars, torch.no_grad():
-            bar = bars.add_task(what, total=len(chosen))
+            bar = bars.add_task(what, total=len(film.pairs))
             return judge_pairs(
-                pictures, cameras, chosen, matcher, on_pair=lambda done, _: bars.update(bar, completed=done)
+                film.pictures,
+                film.cameras,
+                film.pairs,
+                matcher,
+                on_pair=lambda done, _: bars.update(bar, completed=done),
             )
 
 
@@ -193,33 +202,6 @@ def dtype_of(pipeline: Any) -> Any:
     return pipeline.datamanager.train_dataset.cameras.camera_to_worlds.dtype
 
 
-def true_pictures(
-    capture: Path, pipeline: Any, captured: Sequence[Pinholes], cameras: Pinholes
-) -> Callable[[int], Tensor] | None:
-    """Frames of the film as the procedural room shows them; None for other captures."""
-    import torch
-
-    from fb_core.data.capture.captures import read_capture
-    from fb_core.data.rooms.ray_caster import render
-    from fb_core.data.rooms.room import FAMILIES, make_room
-    from fb_core.geometry.similarity import Similarity
-
-    content = read_capture(capture)
-    told = content.extra.get("room")
-    if not isinstance(told, dict) or told.get("family") not in FAMILIES or not isinstance(told.get("seed"), int):
-        return None
-    places = {frame.image_path.name: frame.camera for frame in content.frames}
-    names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
-    if any(name not in places for name in names):
-        return None
-    theirs = [(torch.cat([one.rotations for one in side]), torch.cat([one.centers for one in side])) for side in
-              (captured, [places[name] for name in names])]  # fmt: skip
-    to_capture, room = Similarity.between(*theirs), make_room(told["seed"], FAMILIES[told["family"]])
-    return lambda frame: (
-        render(room, to_capture.cameras(cameras[frame]).to(torch.float32), supersample=2).rgb[0].clamp(0, 1)
-    )
-
-
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of each method that has several captures: the mean over these, and half the 95 % interval of the share within 5
     degrees.
@@ -253,5 +235,5 @@ def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: s
     axes.set_xscale("log")
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     save_figure(figure, path)

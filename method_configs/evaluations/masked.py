@@ -68,6 +68,8 @@ class Paper(TableFiles):
     """Training steps instead of the methods' own."""
     normals_from: int | None = None
     """Step from which normals are regularised, instead of the methods' own."""
+    scale: float = 1.0
+    """Of the pictures that the runs are trained on (0.125 = an eighth of the photos' sides)."""
     model: Path | None = None
     """Model folder; by default the bundled one."""
     inpainter_weights: Path | None = None
@@ -82,6 +84,8 @@ class Paper(TableFiles):
         unknown = sorted(set(self.methods) - set(METHODS))
         if unknown or not self.methods:
             raise ValueError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
+        if not 0 < self.scale <= 1:
+            raise ValueError(f"scale: expected a part of the photos' sides above 0 and up to 1, got {self.scale:g}")
         require_masks(self.data)
         runs = [self._trained(method, normals) for method in self.methods for normals in NORMALS]
         publish(self, [masked_row(run, self) for run in runs], self.seed)
@@ -99,6 +103,8 @@ class Paper(TableFiles):
                 options[name] = self.iterations
         if self.normals_from is not None:
             options["pipeline.model.normal-loss-from"] = self.normals_from
+        if self.scale != 1:
+            options["pipeline.datamanager.camera-res-scale-factor"] = self.scale
         if self.model is not None:
             options["pipeline.datamanager.completion.model"] = self.model.absolute()
         if self.inpainter_weights is not None and method == "nerfiller-grid":

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from helpers.tiny_models import save_tiny_model
+import torch
+from helpers.tiny_models import save_tiny_model, tiny_model
 
+from fb_core.inpainter import Fillerbuster
 from method_configs.benchmarks import inference as inference_benchmark
 from method_configs.benchmarks.inference import Inference, reckoned_seconds
 
@@ -22,9 +26,9 @@ def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
     folder, asked = save_tiny_model(tmp_path / "model"), []
     real = inference_benchmark.timed
 
-    def counted(model, views, size, steps, seed):
+    def counted(model, views, size, steps, seed, clock):
         asked.append((views, size, steps))
-        return real(model, views, size, steps, seed)
+        return real(model, views, size, steps, seed, clock)
 
     monkeypatch.setattr(inference_benchmark, "timed", counted)
     suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
@@ -43,6 +47,27 @@ def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
     assert len(asked) == 6, "what is kept is not measured again"
     Inference(**shared | {"keep": None, "views": (1,)}, steps=(3,), reckoned=False).run()
     assert asked[6:] == [(1, 32, 1), (1, 32, 3)]
+
+
+def test_seconds_of_the_processor_leave_out_what_others_take(tmp_path: Path, monkeypatch):
+    """The time that a sampling waits is no time of this process."""
+    model, real = tiny_model(tmp_path), Fillerbuster.complete
+
+    def waits(*given, **options):
+        time.sleep(0.5)
+        return real(*given, **options)
+
+    monkeypatch.setattr(Fillerbuster, "complete", waits)
+    inference_benchmark.timed(model, 1, 32, 1, 0)
+    began = time.process_time()
+    seconds = inference_benchmark.timed(model, 1, 32, 1, 0, inference_benchmark.CLOCKS["processor"])
+    assert 0 < seconds <= time.process_time() - began
+    assert inference_benchmark.timed(model, 1, 32, 1, 0, inference_benchmark.CLOCKS["wall"]) >= 0.5
+    with pytest.raises(ValueError, match="clock: a processor's seconds say nothing of the device meta"):
+        monkeypatch.setattr(
+            Fillerbuster, "from_pretrained", lambda *_, **__: SimpleNamespace(device=torch.device("meta"))
+        )
+        Inference(clock="processor").run()
 
 
 def test_the_papers_column(tmp_path: Path, monkeypatch):

@@ -93,6 +93,7 @@ def test_runs_differ_in_the_normals_weights_alone(method: str, tmp_path: Path):
         completion={"steps": "3"},
         seed=5,
         inpainter_weights=tmp_path,
+        scale=0.125,
     )
     both = [tyro.cli(AnnotatedBaseConfigUnion, args=command.arguments(method, normals)) for normals in (True, False)]
     weights = [(one.pipeline.model.normal_alignment_weight, one.pipeline.model.normal_tv_weight) for one in both]
@@ -103,6 +104,7 @@ def test_runs_differ_in_the_normals_weights_alone(method: str, tmp_path: Path):
     assert both[0].experiment_name != both[1].experiment_name and both[0].pipeline.datamanager.completion.steps == 3
     both[1].experiment_name, both[1].pipeline.model = both[0].experiment_name, both[0].pipeline.model
     assert both[0] == both[1] and both[0].machine.seed == 5 and both[0].max_num_iterations == 40
+    assert both[0].pipeline.datamanager.camera_res_scale_factor == 0.125
 
 
 def test_scenes_without_masks_are_refused(tiny_capture: Path, tmp_path: Path):
@@ -125,6 +127,9 @@ def test_other_methods_are_refused(tiny_capture: Path):
         Paper(data=tiny_capture, methods=("splatfacto",)).run()
     with pytest.raises(ValueError, match="expected one or more folders of runs"):
         Masked(runs=()).run()
+    for scale in (0.0, 2.0, float("nan")):
+        with pytest.raises(ValueError, match="scale: expected a part of the photos' sides above 0 and up to 1, got"):
+            Paper(data=tiny_capture, scale=scale).run()
 
 
 def test_a_run_that_is_there_is_not_trained_again(tiny_capture: Path, tmp_path: Path, monkeypatch):

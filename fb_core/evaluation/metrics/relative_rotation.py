@@ -102,7 +102,7 @@ def rotation_angle_degrees(one: Float[np.ndarray, "3 3"], other: Float[np.ndarra
 
 def judge_pairs(
     pictures: Callable[[int], Float[Tensor, "3 h w"]],
-    cameras: Pinholes,
+    cameras: Pinholes | Sequence[Pinholes],
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
     *,
@@ -112,7 +112,7 @@ def judge_pairs(
 
     Args:
         pictures: number of a frame -> its picture, RGB in [0, 1]; asked for once for each pair that the frame is in.
-        cameras: of all frames.
+        cameras: of all frames, one batch or one camera each.
         pairs: as ``frame_pairs`` gives them.
         matcher: finds correspondences.
         on_pair: told how many of all pairs are done.

@@ -32,8 +32,8 @@ from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_nerfstudio.bridge import to_nerfstudio, to_pinholes
 from fb_nerfstudio.runs import finished_run
 from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text
-from method_configs.evaluations import consistency as consistency_evaluation
 from method_configs.evaluations.consistency import Consistency
+from method_configs.evaluations.true_films import true_pictures
 
 FRAMES, FPS, SIZE, FOV = 120, 12, 160, 75.0
 
@@ -243,7 +243,7 @@ def test_a_procedural_room_is_also_judged_as_it_is(tmp_path: Path):
     theirs = [world.cameras(frame.camera) for frame in frames]
     names = [frame.image_path for frame in frames]
     pipeline = SimpleNamespace(datamanager=SimpleNamespace(train_dataset=SimpleNamespace(image_filenames=names)))
-    pictures = consistency_evaluation.true_pictures(tmp_path / "room", pipeline, theirs, Pinholes.cat(theirs))
+    pictures = true_pictures(tmp_path / "room", pipeline, theirs, Pinholes.cat(theirs))
     assert pictures is not None
     for number, frame in enumerate(frames):
         assert float((pictures(number) - frame.load_image()).abs().mean()) < 0.01
