@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,6 +35,18 @@ class FeatureCameras:
     """k1 and k2 of each photo's lens, in OpenCV's model; zeros where it is straight."""
     notes: list[str]
     """Sentences on the lenses that were found; empty where they are as the photos tell, or as everybody would guess."""
+
+    def with_those_of(self, other: FeatureCameras, photos: Sequence[int]) -> FeatureCameras:
+        """With what another answer in the same world says of some photos."""
+        chosen = set(photos)
+        merged = {
+            name: [
+                (theirs if index in chosen else ours) for index, (ours, theirs) in enumerate(zip(*both, strict=True))
+            ]
+            for name in ("cameras", "trusted", "reasons", "residuals_degrees", "bends")
+            for both in [(getattr(self, name), getattr(other, name))]
+        }
+        return dataclasses.replace(self, **merged)
 
 
 def one_place(photos: Sequence[PhotoFeatures], panorama: Panorama, *, sure: bool) -> FeatureCameras:

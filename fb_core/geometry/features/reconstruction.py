@@ -1,13 +1,11 @@
-"""A reconstruction from features that grows: photos are placed by points, points by photos, and a bundle adjustment
-mends all.
-"""
+"""A reconstruction from features that grows: points place photos, photos place points, an adjustment mends all."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,13 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.features import trust
 from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
 from fb_core.geometry.features.cameras import FeatureCameras, camera_of
 from fb_core.geometry.features.lenses import LensGuess
 from fb_core.geometry.features.own_lens import LensTrial, Placed, focal_doubt, lens_doubt, lens_trial, sight_of
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_through
 from fb_core.geometry.features.triangulation import nearest_points, tracks_of
-from fb_core.geometry.features.trust import agreeing_shares, deviations_of, doubt, epipolar_misses, outlying, sigma_of
 from fb_core.geometry.pose_solver.verdict import Arrangement
 
 LEAST_ANGLE_DEGREES = 1.5
@@ -33,8 +31,7 @@ _LIE = 0.1  # logarithm of the focal length found over the one told, from which 
 # Of what is believed, for the first photo of a lens of which nothing was told
 _FOCAL_FACTORS = (1.0, 0.5, 0.7, 1.4, 2.0)
 
-_NO_PLACE = "the points that it shares with the others allow no camera with the focal length believed"
-_ALONE = "it can be placed only against other photos, and no camera of these can be trusted"
+_MOST_DOUBTED = "the focal lengths of most photos are in doubt, so that the others stand against too few"
 _TWO_OF_THREE = "another photo shows the same points and fits no camera; which of the photos is wrong cannot be told"
 
 Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
@@ -248,42 +245,89 @@ class Reconstruction:
         ]
         alone = self._copied(self.lenses.one_each())
         bundle, cameras, lenses, _ = alone._bundle(np.flatnonzero(alone.used))
-        found = deviations_of(bundle, alone.lenses.known(lenses))
-        told, shared = self.lenses.believed & (self.registered.sum() > 2), np.bincount(own) > 1
-        asked = ~self.lenses.fixed & (told | (shared & ~self.lenses.believed))  # of two photos, tags are all there is
+        found = trust.deviations_of(bundle, alone.lenses.known(lenses))
         for camera, index in enumerate(cameras.tolist()):
-            if asked[own[index]] and not (self.photos[index].same_lens and shared[own[index]]):
+            if self._own_to_tell[index]:
                 deviation = float(found.focal[found.lens[camera]])
-                doubts[index] = doubts[index] or focal_doubt(deviation, told=bool(told[own[index]]))
+                doubts[index] = doubts[index] or focal_doubt(deviation, told=bool(self.lenses.believed[own[index]]))
         return doubts
+
+    @property
+    def _own_to_tell(self) -> Bool[np.ndarray, " n"]:
+        """Photos that must tell their focal length themselves: nothing but their size says that others have it, or a
+        tag does that no other photo of the same device bears out. Of two photos, tags are all there is.
+        """
+        own = self.lenses.lens
+        shared = (np.bincount(own) > 1)[own]
+        vouched = shared & np.array([photo.same_lens for photo in self.photos])
+        told = self.lenses.believed[own] & (self.registered.sum() > 2)
+        return ~self.lenses.fixed[own] & ~vouched & (told | (shared & ~self.lenses.believed[own]))
+
+    def _plane_doubt(self, matches: Matches) -> str:
+        """What speaks against all cameras if all photos show one plane; empty if they do not."""
+        scale = [
+            self.lenses.focal[lens] / one.tolerance for lens, one in zip(self.lenses.lens, self.photos, strict=True)
+        ]
+        shown = [trust.flat(scale[i] * first, scale[j] * second) for (i, j), first, second in self._placed(matches)]
+        if any(photo.known for photo in self.photos) or not any(shown) or False in shown:
+            return ""
+        own = self._own_to_tell & self.registered
+        untold = {int(lens) for lens in self.lenses.lens[self.registered & ~own] if not self.lenses.believed[lens]}
+        return trust.plane_doubt(int(self.registered.sum()), int(own.sum()) + len(untold))
 
     @property
     def bad_tags(self) -> Bool[np.ndarray, " l"]:
         """Lenses whose focal length is found far from what is told."""
         return self.lenses.believed & ~self.lenses.fixed & (np.abs(np.log(self.lenses.focal / self.lenses.told)) > _LIE)
 
-    def pair_misses(self, matches: Matches) -> dict[tuple[int, int], Float[np.ndarray, " _"]]:
-        """By how many tolerances matches of placed photos miss their epipolar lines."""
-        found = {}
+    def _placed(self, matches: Matches) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+        """Matches of placed photos, in the planes at depth 1."""
         for (i, j), both in matches.items():
             if self.registered[i] and self.registered[j]:
                 first = self.lenses.plane(np.full(len(both), i), self.photos[i].offsets[both[:, 0]])
-                second = self.lenses.plane(np.full(len(both), j), self.photos[j].offsets[both[:, 1]])
-                rotation = self.rotations[j] @ self.rotations[i].T
-                way = self.shifts[j] - rotation @ self.shifts[i]
-                scale = [self.lenses.focal[self.lenses.lens[index]] / self.photos[index].tolerance for index in (i, j)]
-                found[i, j] = epipolar_misses(first, second, rotation, way) * math.sqrt(scale[0] * scale[1])
+                yield (i, j), first, self.lenses.plane(np.full(len(both), j), self.photos[j].offsets[both[:, 1]])
+
+    def pair_misses(self, matches: Matches) -> dict[tuple[int, int], Float[np.ndarray, " _"]]:
+        """By how many tolerances matches of placed photos miss their epipolar lines."""
+        found = {}
+        for (i, j), first, second in self._placed(matches):
+            rotation = self.rotations[j] @ self.rotations[i].T
+            way = self.shifts[j] - rotation @ self.shifts[i]
+            scale = [self.lenses.focal[self.lenses.lens[index]] / self.photos[index].tolerance for index in (i, j)]
+            found[i, j] = trust.epipolar_misses(first, second, rotation, way) * math.sqrt(scale[0] * scale[1])
         return found
 
     def concluded(self, matches: Matches, trials: dict[int, LensTrial]) -> FeatureCameras:
-        """Cameras, and what is to be doubted of each, given what photos say of their lenses."""
+        """Cameras, and what is to be doubted of each, given what photos say of their lenses. Photos whose lens is
+        doubted say nothing of the cameras of others.
+        """
+        doubts = self._lens_doubts(trials)
+        doubted, placed = np.array([bool(one) for one in doubts]) & self.registered, int(self.registered.sum())
+        rest = self._without(doubted)
+        why = rest._plane_doubt(matches) or (_MOST_DOUBTED if 2 * doubted.sum() >= placed else "")
+        if why or not doubted.any():
+            return self._concluded(matches, [one or why for one in doubts])
+        whole, others = self._concluded(matches, doubts), rest._concluded(matches, doubts)
+        return whole.with_those_of(others, np.flatnonzero(rest.registered).tolist())
+
+    def _without(self, doubted: Bool[np.ndarray, " n"]) -> Reconstruction:
+        """This reconstruction, adjusted to the other photos; itself where none or all are doubted."""
+        if not doubted.any() or doubted[self.registered].all():
+            return self
+        other = self._copied(self.lenses)
+        other.registered &= ~doubted
+        other._forget_weak_points()
+        for _ in range(2):
+            other.adjust(steps=10)
+        return other
+
+    def _concluded(self, matches: Matches, doubts: Sequence[str]) -> FeatureCameras:
         used = np.flatnonzero(self.used)
         bundle, cameras_of, lenses, _ = self._bundle(used)
         misses, counts = bundle.misses(), np.bincount(self.owner[used], minlength=len(self.photos)).tolist()
         relative = np.linalg.norm(misses, axis=1) / bundle.tolerance
-        found, sigma = deviations_of(bundle, self.lenses.known(lenses)), sigma_of(relative)
-        lens_doubts = self._lens_doubts(trials)
-        agreeing = agreeing_shares(self.pair_misses(matches), len(self.photos))
+        found, sigma = trust.deviations_of(bundle, self.lenses.known(lenses)), trust.sigma_of(relative)
+        agreeing = trust.agreeing_shares(self.pair_misses(matches), len(self.photos))
         shown = np.bincount(self.owner[np.isfinite(self.points[self.track, 0])], minlength=len(self.photos))
         refused = ~self.registered & (shown >= _TRUSTED_POINTS)
         cameras, reasons, residuals = list[Pinholes | None](), list[str](), list[float]()
@@ -292,21 +336,23 @@ class Reconstruction:
                 cameras.append(None)
                 residuals.append(float("nan"))
                 shared = max(counts[index], int(shown[index]))
-                reasons.append(_NO_PLACE if refused[index] else _few(shared, _FEWEST_POINTS, "a camera needs"))
+                reasons.append(
+                    trust.NO_PLACE if refused[index] else trust.few_points(shared, _FEWEST_POINTS, "a camera needs")
+                )
                 continue
             mine = self.owner[used] == index
             focal = self.lenses.focal[self.lenses.lens[index]]
             cameras.append(camera_of(photo, self.rotations[index], self.shifts[index], focal))
             residuals.append(float(np.degrees(np.sqrt(np.square(misses[mine]).mean()) / focal)))
             if counts[index] < _TRUSTED_POINTS:
-                reason = _few(counts[index], _TRUSTED_POINTS, "expected")
+                reason = trust.few_points(counts[index], _TRUSTED_POINTS, "expected")
             elif refused.any() and self.registered.sum() == 2:
                 reason = _TWO_OF_THREE
             else:
-                reason = outlying(relative[mine], sigma) or lens_doubts[index]
-            reasons.append(reason or doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
+                reason = trust.outlying(relative[mine], sigma) or doubts[index]
+            reasons.append(reason or trust.doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
         if reasons.count("") == 1:  # cameras stand where they stand against one another
-            reasons[reasons.index("")] = _ALONE
+            reasons[reasons.index("")] = trust.ALONE
         return FeatureCameras(
             cameras=cameras,
             trusted=[not reason for reason in reasons],
@@ -344,10 +390,6 @@ class Reconstruction:
         weak = np.bincount(self.track[self.used], minlength=len(self.points)) < 2
         self.points[weak] = np.nan
         self.good[weak[self.track]] = True
-
-
-def _few(count: int, least: int, why: str) -> str:
-    return f"shares too few features with the others ({count} points, {why} {least})"
 
 
 def _twice(owner: np.ndarray, track: np.ndarray) -> np.ndarray:

@@ -4,6 +4,11 @@ them.
 A bundle adjustment gives every camera a place, also where nothing fixes it: behind a weak link, along the axis of a
 lens whose focal length is not known, before a plane. Its normal equations say how well each camera is determined
 against the others.
+
+Before a plane that is not all: a further photo gives the eight numbers of a homography, whatever it shows, and asks
+for six of its camera and for its focal length, unless something vouches for that. What is not counted more often than
+it is asked for can be explained by other cameras as well, at other focal lengths, however small the deviations at any
+one of these explanations are.
 """
 
 from __future__ import annotations
@@ -18,6 +23,13 @@ from fb_core.geometry.features.bundle_adjustment import Bundle, Equations, Lense
 
 PESSIMISM = 3.0
 """Observations err together (the same tracks, the same lens), which their scatter does not tell."""
+NO_PLACE = "the points that it shares with the others allow no camera with the focal length believed"
+"""What speaks against a photo that could not be placed."""
+ALONE = "it can be placed only against other photos, and no camera of these can be trusted"
+"""What speaks against the only camera of which nothing else does."""
+_ON_THE_PLANE = 3.0  # tolerances: a few matches fix the homography, and err as the others do
+_FLAT = 0.8  # share of two photos' matches from which they show a plane, and the others are mistakes
+_FEWEST = 8  # matches that say something
 _RAYLEIGH = 1.177  # median of the distribution of distances, in deviations per axis
 _LEAST_SIGMA = 0.1  # tolerances; places of features are no better
 _MOST_TURN_DEGREES, _MOST_SHIFT = (
@@ -181,6 +193,11 @@ def outlying(relative: Float[np.ndarray, " o"], sigma: float) -> str:
     return "" if own <= sigma else f"its features miss their points {own / sigma * PESSIMISM:.0f} times as far as usual"
 
 
+def few_points(count: int, least: int, why: str) -> str:
+    """What speaks against a photo that shows so few points of the others."""
+    return f"shares too few features with the others ({count} points, {why} {least})"
+
+
 def doubt(found: Deviations, camera: int, agreeing: float) -> str:
     """What speaks against one of the cameras of a bundle; empty if nothing does."""
     if agreeing < _LEAST_AGREEING:
@@ -196,4 +213,40 @@ def doubt(found: Deviations, camera: int, agreeing: float) -> str:
     off = f"{why}its direction by {turn:.2g} degrees, its place by {min(shift, 9.99):.0%} of the extent"
     return (
         f"the photos hardly determine its camera ({off} or so); add photos that overlap more, from places farther apart"
+    )
+
+
+def flat(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> bool | None:
+    """Whether one homography explains matches of two photos (places in tolerances); None if they are too few to say.
+
+    The way from the closer look to the other one decides: on the way back, errors grow.
+    """
+    import cv2
+
+    pictured = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
+    if pictured.sum() < _FEWEST:
+        return None
+    share = 0.0
+    for one, other in ((first, second), (second, first)):
+        _, kept = cv2.findHomography(one[pictured], other[pictured], cv2.USAC_MAGSAC, _ON_THE_PLANE, None, 2000, 0.999)
+        share = max(share, 0.0 if kept is None else float(kept.mean()))
+    return share >= _FLAT
+
+
+def surplus_of_a_plane(photos: int, focal_lengths: int) -> int:
+    """By how many numbers photos of a plane tell more than their cameras and so many focal lengths that nothing else
+    tells. The plane asks for three; the world's place, turn and scale for none of seven.
+    """
+    return 8 * (photos - 1) - (6 * photos + focal_lengths + 3 - 7)
+
+
+def plane_doubt(photos: int, focal_lengths: int) -> str:
+    """What speaks against cameras of photos that all show one plane; empty if they determine more than is asked for."""
+    if surplus_of_a_plane(photos, focal_lengths) > 0:
+        return ""
+    if focal_lengths == 0:
+        return f"{photos} photos of a plane fit other cameras as well; add photos from other places"
+    return (
+        f"{photos} photos of a plane fit other cameras as well, with other focal lengths; add photos that show "
+        "something before or behind it, or tell their focal lengths"
     )

@@ -21,7 +21,7 @@ _READ = 6e9  # a million pixels of a file
 _FEATURES = 42e9  # a million pixels in which features are looked for
 _PER_PIXEL = 1 / 20  # features per pixel, at most
 _MATCH = 1000  # two features of two photos
-_BUILD, _CROWD = 4.5e9, 24  # a photo and each of the others, up to so many, that cameras are found together with
+_BUILD, _CROWD = 6.3e9, 24  # a photo and each of the others, up to so many, that cameras are found together with
 _DRAW, _SHOWN = 400e9, 12e9  # the sheet and the cameras' picture; each picture in them
 _SLOWEST, _FASTEST = 8.0, 1 / 8  # by which the rest is corrected at most
 
