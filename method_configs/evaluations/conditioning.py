@@ -60,7 +60,7 @@ class Conditioning(TableFiles):
         sampling = model.recommended_sampling
         sampling = sampling if self.steps is None else dataclasses.replace(sampling, steps=self.steps)
         sequences = self._sequences(self.size or model.size)
-        cells = [(known, number) for known in self.known for number in range(self.sequences)]
+        cells = [(known, number) for known in dict.fromkeys(self.known) for number in range(self.sequences)]
         scores: dict[int, list[dict[str, float]]] = {known: [] for known in self.known}
         for known, number in track(cells, description="sequences", transient=True):
             scores[known].append(self._scores(model, sequences[number], known, number, sampling))
@@ -115,7 +115,7 @@ class Conditioning(TableFiles):
         from fb_core.evaluation.figures.contact_sheet import Strip, write_contact_sheet
 
         strips = [Strip(heading="Hidden views", pictures=list(views.images[: self.hidden]))]
-        for known in self.known:
+        for known in dict.fromkeys(self.known):
             generated = generated_from(model, views, hidden=self.hidden, known=known, sampling=sampling, seed=self.seed)
             strips.append(Strip(heading=f"From {known} known", pictures=list(generated)))
         path.parent.mkdir(parents=True, exist_ok=True)

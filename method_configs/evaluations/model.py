@@ -90,7 +90,10 @@ class ModelOnCaptures(TableFiles):
         question = self._questions(size)
         question(self.lengths[-1], 0)  # what is wrong with the data is said before anything is computed
         cells = [
-            (name, length, number) for name in models for length in self.lengths for number in range(self.sequences)
+            (name, length, number)
+            for name in models
+            for length in dict.fromkeys(self.lengths)  # one that is named twice is one
+            for number in range(self.sequences)
         ]
         scores: dict[tuple[str, int], list[dict[str, float]]] = {}
         for name, length, number in track(cells, description="sequences", transient=True):

@@ -90,7 +90,14 @@ def test_several_models_in_one_table_and_nothing_twice(tiny_capture: Path, tmp_p
     suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
     files = {name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()}
     shutil.copytree(tiny_capture, tmp_path / "captures" / "a" / "b")
-    options = {"data": tmp_path / "captures", "models": models, "lengths": (4,), "sequences": 2, "times": 2, "steps": 1}
+    options = {
+        "data": tmp_path / "captures",
+        "models": models,
+        "lengths": (4, 4),
+        "sequences": 2,
+        "times": 2,
+        "steps": 1,
+    }
     command = ModelOnCaptures(**options, keep=tmp_path / "kept", **files)
     command.run()
     rows = json.loads(files["json"].read_text())["rows"]
@@ -143,7 +150,7 @@ def test_the_same_hidden_views_from_more_and_more_known_ones(tiny_capture: Path,
     options = {
         "data": tiny_capture,
         "model": folder,
-        "known": (1, 4),
+        "known": (1, 4, 4),
         "hidden": 2,
         "sequences": 2,
         "steps": 1,

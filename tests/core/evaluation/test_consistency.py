@@ -255,6 +255,11 @@ def test_a_procedural_room_is_also_judged_as_it_is(tmp_path: Path):
         ({"runs": ()}, "expected one or more folders of runs"),
         ({"size": 8}, "got seconds 10, fps 24, size 8"),
         ({"fps": 0.0}, "fps 0,"),
+        ({"fps": math.inf}, "frames of the film, seconds times fps: expected 1 to 10000, got inf"),
+        ({"seconds": 1e9}, "frames of the film, seconds times fps: expected 1 to 10000, got 2.4e"),
+        ({"size": 10**6}, "size: expected 32 to 8192, got 1000000"),
+        ({"fov": 0.0}, "fov: expected 1 to 179, got 0"),
+        ({"fov": math.nan}, "fov: expected 1 to 179, got nan"),
     ],
 )
 def test_bad_options_are_told(options, said, tmp_path: Path):
