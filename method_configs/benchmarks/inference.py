@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between, require_room
 from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
@@ -28,6 +29,7 @@ PAPER_SECONDS = {
 """Table 3 of the paper: an A100, 50 steps, with encoding and decoding; by side in pixels and number of views."""
 _PAPER_STEPS = 50
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
+_BYTES = 40  # of a pixel: colours, what is known, rays, in float32
 _FEW, _FEWEST = (4, 12), (1, 2)  # steps that are measured where the rest is reckoned
 _logger = logging.getLogger(__name__)
 
@@ -73,6 +75,10 @@ class Inference(TableFiles):
             raise ValueError(
                 f"inference: expected sizes that are multiples of 16 pixels, got {' '.join(map(str, self.sizes))}"
             )
+        require_between("views", max(self.views), 1, MOST_VIEWS)
+        require_between("sizes", max(self.sizes), 16, MOST_SIDE)
+        pixels = max(self.views) * max(self.sizes) ** 2
+        require_room("inference", _BYTES * pixels, f"{max(self.views)} views of {max(self.sizes)} pixels")
         if self.released_architecture and self.model is not None:
             raise ValueError("inference: expected --model or --released-architecture, got both; leave one out")
         device = chosen_device(self.device)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
@@ -56,6 +57,9 @@ class Conditioning(TableFiles):
                 f"got known {' '.join(map(str, self.known)) or 'none'}, hidden {self.hidden}, sequences "
                 f"{self.sequences}"
             )
+        require_between("known and hidden views together", max(self.known) + self.hidden, 2, MOST_VIEWS)
+        if self.size is not None:
+            require_between("size", self.size, 16, MOST_SIDE)
         model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
         sampling = model.recommended_sampling
         sampling = sampling if self.steps is None else dataclasses.replace(sampling, steps=self.steps)

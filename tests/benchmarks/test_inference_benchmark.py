@@ -122,6 +122,9 @@ def test_the_papers_column(tmp_path: Path, monkeypatch):
     [
         ({"sizes": (100,)}, "multiples of 16 pixels, got 100"),
         ({"views": ()}, "expected numbers of views"),
+        ({"sizes": (16000,)}, "sizes: expected 16 to 8192, got 16000"),
+        ({"views": (10**6,)}, "views: expected 1 to 10000, got 1000000"),
+        ({"views": (10**4,), "sizes": (8192,)}, "inference: 10000 views of 8192 pixels need .* GiB of memory, but"),
         ({"device": "moon"}, "device: expected one that this machine has, such as cpu, cuda or cuda:N, got 'moon'"),
     ],
 )

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import tyro
+from PIL import Image
 
 from fb_core.completion.results.completed_views import CompletedViews, Origin
 from fb_core.data.capture.captures import read_capture
@@ -123,6 +124,21 @@ def test_scenes_without_masks_are_refused(tiny_capture: Path, tmp_path: Path):
     ):
         Paper(data=tiny_capture, output=tmp_path / "out").run()
     assert not (tmp_path / "out").exists()
+
+
+def test_masks_in_alpha_are_masks_as_in_nerfillers_scenes(tiny_capture: Path):
+    for frame in read_capture(tiny_capture).frames:
+        with Image.open(frame.image_path) as picture:
+            pixels = picture.convert("RGBA")
+        pixels.putalpha(Image.new("L", pixels.size, 255))
+        pixels.paste((0, 0, 0, 0), (4, 4, 12, 12))
+        pixels.save(frame.image_path)
+    content = json.loads((tiny_capture / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame.pop("mask_path", None)
+    (tiny_capture / "transforms.json").write_text(json.dumps(content))
+    assert all(frame.mask_path is None for frame in read_capture(tiny_capture).frames)
+    require_masks(tiny_capture)
 
 
 def test_other_methods_are_refused(tiny_capture: Path):
