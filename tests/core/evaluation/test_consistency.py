@@ -216,7 +216,12 @@ def test_the_command_judges_a_run_writes_all_files_and_goes_on(monkeypatch, tmp_
     assert {"command", "commit", "hardware", "seed"} <= set(content)
     row = content["rows"][0]
     assert row["method"] == "fillerbuster" and row["rra_5"] >= 0.8 and "SIFT" in row["part"]
-    assert next(csv.DictReader(files["csv"].open()))["method"] == "fillerbuster"
+    line = next(csv.DictReader(files["csv"].open()))
+    assert line["method"] == "fillerbuster"
+    assert {name: line[name] for name in ("command", "commit", "hardware")} == {
+        name: content[name] for name in ("command", "commit", "hardware")
+    }
+    assert line["seed"] == "0" == str(content["seed"])
     assert "| fillerbuster |" in files["markdown"].read_text() and files["figure"].stat().st_size > 1000
 
     def never(run):
