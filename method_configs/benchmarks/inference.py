@@ -11,10 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between, require_room
 from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
+    import torch
+
+    from fb_core.checkpoint import ModelConfig
     from fb_core.evaluation.results import Report
     from fb_core.inpainter import Fillerbuster
 
@@ -25,7 +29,8 @@ PAPER_SECONDS = {
 """Table 3 of the paper: an A100, 50 steps, with encoding and decoding; by side in pixels and number of views."""
 _PAPER_STEPS = 50
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
-_FEW = (4, 12)  # steps that are measured where the rest is reckoned
+_BYTES = 40  # of a pixel: colours, what is known, rays, in float32
+_FEW, _FEWEST = (4, 12), (1, 2)  # steps that are measured where the rest is reckoned
 _logger = logging.getLogger(__name__)
 
 
@@ -37,6 +42,9 @@ class Inference(TableFiles):
 
     model: Path | None = None
     """Model folder; by default the bundled one."""
+    released_architecture: bool = False
+    """The released model's sizes with random weights instead of a model, as what a step costs does not depend on them
+    (4 GB of memory); on CPUs 1 and 2 steps are measured and the rest is reckoned."""
     views: tuple[int, ...] = (4, 8, 16, 32)
     """Views of a sequence, half of them known."""
     sizes: tuple[int, ...] = (256, 512)
@@ -67,7 +75,18 @@ class Inference(TableFiles):
             raise ValueError(
                 f"inference: expected sizes that are multiples of 16 pixels, got {' '.join(map(str, self.sizes))}"
             )
-        model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
+        require_between("views", max(self.views), 1, MOST_VIEWS)
+        require_between("sizes", max(self.sizes), 16, MOST_SIDE)
+        pixels = max(self.views) * max(self.sizes) ** 2
+        require_room("inference", _BYTES * pixels, f"{max(self.views)} views of {max(self.sizes)} pixels")
+        if self.released_architecture and self.model is not None:
+            raise ValueError("inference: expected --model or --released-architecture, got both; leave one out")
+        device = chosen_device(self.device)
+        model = (
+            untrained(None, self.seed, device)
+            if self.released_architecture
+            else Fillerbuster.from_pretrained(self.model, device=device)
+        )
         if self.clock == "processor" and model.device.type != "cpu":
             raise ValueError(
                 f"clock: a processor's seconds say nothing of the device {model.device}; leave --clock out, or add "
@@ -83,7 +102,8 @@ class Inference(TableFiles):
     def _rows(self, model: Fillerbuster, size: int, views: int, reckoned: bool) -> list[dict[str, Any]]:
         from fb_core.evaluation.results import hardware
 
-        counts = _FEW if reckoned else tuple(self.steps)
+        few = _FEWEST if self.released_architecture else _FEW
+        counts = few if reckoned else tuple(self.steps)
         asked = {
             "model": model.model_hash,
             "hardware": hardware(),
@@ -98,7 +118,9 @@ class Inference(TableFiles):
             timed(model, views, size, 1, self.seed, clock)  # what is set up at first use
             return {str(count): timed(model, views, size, count, self.seed, clock) for count in counts}
 
-        seconds = {int(count): value for count, value in self.kept(f"{size}-{views}", asked, measure).items()}
+        weights = model.model_hash[:8] or "random weights"
+        kept = self.kept(f"{weights}/{size}-{views}".replace(" ", "-"), asked, measure)
+        seconds = {int(count): value for count, value in kept.items()}
         rows = []
         for steps in self.steps:
             value = reckoned_seconds(seconds, steps) if reckoned else seconds[steps]
@@ -106,7 +128,7 @@ class Inference(TableFiles):
             preset = model.info.get("preset", "the model")
             rows.append(
                 {
-                    "part": f"inference with {preset} ({model.model_hash[:8]}), half of the views known",
+                    "part": f"inference with {preset} ({weights}), half of the views known",
                     "size": size, "views": views, "steps": steps, "seconds": value,
                     "how": "reckoned" if reckoned else "measured", "clock": self.clock,
                     "device": str(model.device), "parameters": sum(weight.numel() for weight in model.dit.parameters()),
@@ -114,6 +136,28 @@ class Inference(TableFiles):
                 }
             )  # fmt: skip
         return rows
+
+
+def untrained(sizes: ModelConfig | None, seed: int, device: torch.device) -> Fillerbuster:
+    """A model with random weights, by default of the released sizes; its empty prompt has as many words as CLIP's."""
+    import dataclasses
+
+    import torch
+
+    from fb_core.checkpoint import ModelConfig
+    from fb_core.inpainter import Fillerbuster
+    from fb_core.networks.transformer.dit import DiTConfig
+    from fb_core.networks.vae import IMAGE_VAE, RAYMAP_VAE
+    from method_configs.benchmarks.networks import WORDS, random_model
+
+    sizes = sizes or ModelConfig(transformer=DiTConfig(), image_vae=IMAGE_VAE, raymap_vae=RAYMAP_VAE)
+    model = random_model(sizes, seed)
+    for network in (model.dit, model.image_vae, model.raymap_vae):
+        network.to(device)
+    width = sizes.transformer.text_width
+    prompt = torch.randn(WORDS, width, generator=torch.Generator().manual_seed(seed)).to(device) if width else None
+    info = {"preset": "the released architecture"}
+    return Fillerbuster(dataclasses.replace(model, info=info, empty_prompt=prompt))
 
 
 def reckoned_seconds(seconds: dict[int, float], steps: int) -> float:

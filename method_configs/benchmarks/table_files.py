@@ -33,7 +33,7 @@ class TableFiles:
     json: Path | None = None
     """Write all measurements to this file."""
     csv: Path | None = None
-    """Write the rows to this file."""
+    """Write the rows to this file, each with command, commit, hardware and seed."""
     markdown: Path | None = None
     """Write the table to this file, with command, commit, hardware and seed."""
     figure: Path | None = None
@@ -45,10 +45,14 @@ class TableFiles:
 
         drawings = [] if self.figure is None else [lambda figure=self.figure: draw(report, figure)]
         show(report, self.json, drawings)
-        for path, text in ((self.csv, csv_text), (self.markdown, lambda rows: markdown_text(report, command_line()))):
+        texts = (
+            (self.csv, lambda: csv_text(with_origin(report, command_line()))),
+            (self.markdown, lambda: markdown_text(report, command_line())),
+        )
+        for path, text in texts:
             if path is not None:
                 with whole_file(path) as unfinished:
-                    unfinished.write_text(text(report.rows), encoding="utf-8")
+                    unfinished.write_text(text(), encoding="utf-8")
                 _logger.info("wrote %s", path)
 
     def kept(self, name: str, asked: Mapping[str, Any], measure: Callable[[], Any]) -> Any:
@@ -78,6 +82,14 @@ class TableFiles:
                 json_format.dumps({"asked": question, "measured": measured}, indent=1) + "\n", encoding="utf-8"
             )
         return measured
+
+
+def with_origin(report: Report, command: str) -> list[dict[str, Any]]:
+    """The rows, each with what is needed to make it again, for a form that has no other place for it."""
+    from fb_core.evaluation.results import commit, hardware
+
+    origin = {"seed": report.seed, "commit": commit(), "hardware": hardware(), "command": command}
+    return [{**row, **origin} for row in report.rows]
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -203,6 +203,9 @@ def export(
     export_run(run, format=format, output=output, held_out=held_out, overwrite=overwrite)
 
 
+_FORMATS = {"figure": (".png", ".svg", ".pdf"), "sheet": (".png",)}
+
+
 def bench(
     *,
     benchmark: tyro.conf.OmitArgPrefixes[
@@ -273,14 +276,36 @@ def _what_is_kept(command: _Measures) -> str:
 
 
 def _require_usable(command: object) -> None:
-    """Raises ValueError, before hours of measuring, where a result would take the place of a file that is none, and for
+    """Raises ValueError, before hours of measuring, where a result could not be written in the end (another file or
+    another result of the same command has its place, no folder can be made there, figures have no such format), and for
     a seed that nothing can be drawn with.
     """
+    places: dict[Path, str] = {}
     for name in ("json", "csv", "markdown", "figure", "sheet"):
         path = getattr(command, name, None)
         if isinstance(path, Path):
             require_own_or_new(path)
+            _require_folder(path.parent)
+            is_device = path.exists() and not path.is_file()
+            if not is_device and (other := places.setdefault(path.absolute(), name)) != name:
+                raise ValueError(f"{name}: {path} is the place of --{other} already; choose another name")
+            if name in _FORMATS and path.suffix.lower() not in _FORMATS[name]:
+                raise ValueError(
+                    f"{name}: expected a name that ends with {', '.join(_FORMATS[name])}, got {path.name}; rename it"
+                )
+    for name in ("keep", "output"):
+        if isinstance(folder := getattr(command, name, None), Path):
+            _require_folder(folder)
     require_between("seed", getattr(command, "seed", 0), 0, MOST_SEED)
+
+
+def _require_folder(folder: Path) -> None:
+    """Raises ValueError where a folder neither is nor can be made, because a file has the place of one above it."""
+    there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), None)
+    if there is not None and not there.is_dir():
+        raise ValueError(
+            f"{folder}: expected a folder, or a place for one, but {there} is a file; choose another place"
+        )
 
 
 def compile_() -> None:

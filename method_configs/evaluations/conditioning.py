@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
@@ -56,11 +57,14 @@ class Conditioning(TableFiles):
                 f"got known {' '.join(map(str, self.known)) or 'none'}, hidden {self.hidden}, sequences "
                 f"{self.sequences}"
             )
+        require_between("known and hidden views together", max(self.known) + self.hidden, 2, MOST_VIEWS)
+        if self.size is not None:
+            require_between("size", self.size, 16, MOST_SIDE)
         model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
         sampling = model.recommended_sampling
         sampling = sampling if self.steps is None else dataclasses.replace(sampling, steps=self.steps)
         sequences = self._sequences(self.size or model.size)
-        cells = [(known, number) for known in self.known for number in range(self.sequences)]
+        cells = [(known, number) for known in dict.fromkeys(self.known) for number in range(self.sequences)]
         scores: dict[int, list[dict[str, float]]] = {known: [] for known in self.known}
         for known, number in track(cells, description="sequences", transient=True):
             scores[known].append(self._scores(model, sequences[number], known, number, sampling))
@@ -115,7 +119,7 @@ class Conditioning(TableFiles):
         from fb_core.evaluation.figures.contact_sheet import Strip, write_contact_sheet
 
         strips = [Strip(heading="Hidden views", pictures=list(views.images[: self.hidden]))]
-        for known in self.known:
+        for known in dict.fromkeys(self.known):
             generated = generated_from(model, views, hidden=self.hidden, known=known, sampling=sampling, seed=self.seed)
             strips.append(Strip(heading=f"From {known} known", pictures=list(generated)))
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -91,6 +92,10 @@ class Consistency(TableFiles):
                 "consistency: expected seconds and fps above 0, 32 or more pixels and a pair, "
                 f"got seconds {self.seconds:g}, fps {self.fps:g}, size {self.size}, pairs {self.pairs}"
             )
+        require_between("frames of the film, seconds times fps", self.seconds * self.fps, 1, MOST_VIEWS)
+        require_between("size", self.size, 32, MOST_SIDE)
+        if self.fov is not None:
+            require_between("fov", self.fov, 1, 179)
 
     def _judged(self, run: Path, matcher: Matcher, told: set[str]) -> dict[str, Any]:
         """``pairs`` of each film as plain values, the run's ``method``, its ``capture``'s name, its ``model``'s hash.

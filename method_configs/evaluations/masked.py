@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
 from method_configs.benchmarks.table_files import TableFiles
 from method_configs.evaluations.consistency import scene_name
 
@@ -84,11 +85,30 @@ class Paper(TableFiles):
         unknown = sorted(set(self.methods) - set(METHODS))
         if unknown or not self.methods:
             raise ValueError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
-        if not 0 < self.scale <= 1:
-            raise ValueError(f"scale: expected a part of the photos' sides above 0 and up to 1, got {self.scale:g}")
-        require_masks(self.data)
+        self._check()
         runs = [self._trained(method, normals) for method in self.methods for normals in NORMALS]
         publish(self, [masked_row(run, self) for run in runs], self.seed)
+
+    def _check(self) -> None:
+        """Raises ValueError, before hours of training, for what would end them or what follows them."""
+        from fb_core.checkpoint import read_config
+        from fb_core.inpainter import BUNDLED_MODEL
+        from method_configs.evaluations.ablations import _distance
+
+        if not 0 < self.scale <= 1:
+            raise ValueError(f"scale: expected a part of the photos' sides above 0 and up to 1, got {self.scale:g}")
+        if self.iterations is not None:
+            require_between("iterations", self.iterations, 1, MOST_TRAINING_STEPS)
+        if self.normals_from is not None:
+            require_between("normals-from", self.normals_from, 0, MOST_TRAINING_STEPS)
+        if self.inpainter_weights is not None and not self.inpainter_weights.is_dir():
+            raise ValueError(
+                f"inpainter-weights: no folder {self.inpainter_weights}; give the diffusers folder of a 2D inpainter, "
+                "or leave it out for OpenCV's"
+            )
+        _distance(self.lpips)
+        read_config(self.model or BUNDLED_MODEL)
+        require_masks(self.data)
 
     def arguments(self, method: str, normals: bool) -> list[str]:
         """What follows ``ns-train``; runs with and without normals differ in the two weights alone."""
@@ -173,6 +193,11 @@ def masked_row(run: Path, files: Masked | Paper) -> dict[str, Any]:
 
     config, state = read_run(run)
     step, model = state["step"], config.pipeline.model
+    if config.pipeline.datamanager.completion.task != "inpaint":
+        raise ValueError(
+            f"run {run}: expected a run of {' or '.join(METHODS)}, got one of {config.method_name}, which inpaints no "
+            "captured pictures; for films of it there is fillerbuster eval consistency"
+        )
     normals = step > model.normal_loss_from and max(model.normal_alignment_weight, model.normal_tv_weight) > 0
     capture, asked = capture_of(config), identity_of(run, state) | {"lpips": str(files.lpips)}
     measured = files.kept(

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
 from method_configs.benchmarks.table_files import TableFiles
 
@@ -78,6 +79,9 @@ class ModelOnCaptures(TableFiles):
                 f"got lengths {' '.join(map(str, self.lengths)) or 'none'}, sequences {self.sequences}, times "
                 f"{self.times}"
             )
+        require_between("lengths", max(self.lengths), 4, MOST_VIEWS)
+        if self.size is not None:
+            require_between("size", self.size, 16, MOST_SIDE)
         distance, models = _distance(self.lpips), {}
         for folder in self.models or (None,):
             model = Fillerbuster.from_pretrained(folder, device=chosen_device(self.device))
@@ -90,7 +94,10 @@ class ModelOnCaptures(TableFiles):
         question = self._questions(size)
         question(self.lengths[-1], 0)  # what is wrong with the data is said before anything is computed
         cells = [
-            (name, length, number) for name in models for length in self.lengths for number in range(self.sequences)
+            (name, length, number)
+            for name in models
+            for length in dict.fromkeys(self.lengths)  # one that is named twice is one
+            for number in range(self.sequences)
         ]
         scores: dict[tuple[str, int], list[dict[str, float]]] = {}
         for name, length, number in track(cells, description="sequences", transient=True):

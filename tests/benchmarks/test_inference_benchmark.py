@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from pathlib import Path
@@ -11,7 +12,10 @@ import pytest
 import torch
 from helpers.tiny_models import save_tiny_model, tiny_model
 
+from fb_core import checkpoint
 from fb_core.inpainter import Fillerbuster
+from fb_core.networks.transformer.dit import DiT, DiTConfig
+from fb_core.networks.vae import IMAGE_VAE, RAYMAP_VAE
 from method_configs.benchmarks import inference as inference_benchmark
 from method_configs.benchmarks.inference import Inference, reckoned_seconds
 
@@ -47,6 +51,38 @@ def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
     assert len(asked) == 6, "what is kept is not measured again"
     Inference(**shared | {"keep": None, "views": (1,)}, steps=(3,), reckoned=False).run()
     assert asked[6:] == [(1, 32, 1), (1, 32, 3)]
+
+
+def test_the_released_architecture_is_reckoned_from_one_step_without_weights(tmp_path: Path, monkeypatch):
+    """Its sizes are the released ones; here they are shrunk, but for the measure."""
+    with torch.device("meta"):
+        assert sum(weight.numel() for weight in DiT(DiTConfig()).parameters()) > 600e6
+    small = save_tiny_model(tmp_path / "model")
+    monkeypatch.setattr(
+        inference_benchmark, "untrained", lambda sizes, seed, device: Fillerbuster(checkpoint.load(small))
+    )
+    shared = {"released_architecture": True, "views": (2,), "sizes": (32,), "device": "cpu"}
+    Inference(**shared, keep=tmp_path / "kept", json=tmp_path / "table.json").run()
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    assert [(row["steps"], row["how"]) for row in rows] == [(50, "reckoned"), (24, "reckoned")]
+    kept = json.loads((tmp_path / "kept" / "random-weights" / "32-2.json").read_text())["measured"]
+    assert list(kept) == ["1", "2"] and "random weights" in rows[0]["part"]
+    assert rows[0]["seconds"] == pytest.approx(kept["1"] + 49 * max(0, kept["2"] - kept["1"]))
+    with pytest.raises(ValueError, match="expected --model or --released-architecture, got both"):
+        Inference(**shared, model=small).run()
+
+
+def test_random_weights_of_a_model_that_reads_text_complete_views():
+    """As the released one does, with an empty prompt; the sizes are a miniature's."""
+    image_vae, raymap_vae = (
+        dataclasses.replace(sizes, widths=(8, 8, 8, 8), norm_groups=4) for sizes in (IMAGE_VAE, RAYMAP_VAE)
+    )
+    sizes = checkpoint.ModelConfig(
+        transformer=DiTConfig(heads=2, head_dim=16, depth=1), image_vae=image_vae, raymap_vae=raymap_vae
+    )
+    model = inference_benchmark.untrained(sizes, 0, torch.device("cpu"))
+    assert model.reads_text and model.model_hash == "" and model.info["preset"] == "the released architecture"
+    assert inference_benchmark.timed(model, 2, 32, 1, 0) > 0
 
 
 def test_seconds_of_the_processor_leave_out_what_others_take(tmp_path: Path, monkeypatch):
@@ -86,6 +122,9 @@ def test_the_papers_column(tmp_path: Path, monkeypatch):
     [
         ({"sizes": (100,)}, "multiples of 16 pixels, got 100"),
         ({"views": ()}, "expected numbers of views"),
+        ({"sizes": (16000,)}, "sizes: expected 16 to 8192, got 16000"),
+        ({"views": (10**6,)}, "views: expected 1 to 10000, got 1000000"),
+        ({"views": (10**4,), "sizes": (8192,)}, "inference: 10000 views of 8192 pixels need .* GiB of memory, but"),
         ({"device": "moon"}, "device: expected one that this machine has, such as cpu, cuda or cuda:N, got 'moon'"),
     ],
 )

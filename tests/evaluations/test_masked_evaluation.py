@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import tyro
+from PIL import Image
 
 from fb_core.completion.results.completed_views import CompletedViews, Origin
 from fb_core.data.capture.captures import read_capture
@@ -48,9 +49,12 @@ def test_an_error_of_a_tenth_is_twenty_decibels():
     assert agreement(pipeline_of(bank, 0.0), bank, None)["ssim"] == pytest.approx(1)
 
 
-def run_of(monkeypatch: pytest.MonkeyPatch, folder: Path, *, step: int, bank: CompletedViews | None) -> Path:
+def run_of(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, *, step: int, bank: CompletedViews | None, task: str = "inpaint"
+) -> Path:
     model = SimpleNamespace(normal_loss_from=100, normal_alignment_weight=0.01, normal_tv_weight=0.0)
-    parts = SimpleNamespace(model=model, datamanager=SimpleNamespace(data=Path("scene")))
+    completion = SimpleNamespace(task=task)
+    parts = SimpleNamespace(model=model, datamanager=SimpleNamespace(data=Path("scene"), completion=completion))
     monkeypatch.setattr(
         finished_run, "read_run", lambda run: (SimpleNamespace(method_name=METHODS[0], pipeline=parts), {"step": step})
     )
@@ -122,11 +126,52 @@ def test_scenes_without_masks_are_refused(tiny_capture: Path, tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+def test_masks_in_alpha_are_masks_as_in_nerfillers_scenes(tiny_capture: Path):
+    for frame in read_capture(tiny_capture).frames:
+        with Image.open(frame.image_path) as picture:
+            pixels = picture.convert("RGBA")
+        pixels.putalpha(Image.new("L", pixels.size, 255))
+        pixels.paste((0, 0, 0, 0), (4, 4, 12, 12))
+        pixels.save(frame.image_path)
+    content = json.loads((tiny_capture / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame.pop("mask_path", None)
+    (tiny_capture / "transforms.json").write_text(json.dumps(content))
+    assert all(frame.mask_path is None for frame in read_capture(tiny_capture).frames)
+    require_masks(tiny_capture)
+
+
 def test_other_methods_are_refused(tiny_capture: Path):
     with pytest.raises(ValueError, match="expected some of fillerbuster-masked, nerfiller-grid, got splatfacto"):
         Paper(data=tiny_capture, methods=("splatfacto",)).run()
     with pytest.raises(ValueError, match="expected one or more folders of runs"):
         Masked(runs=()).run()
+
+
+def test_a_run_that_inpaints_nothing_is_refused(tmp_path: Path, monkeypatch):
+    """Its generated views are new ones, which table 1 is not about."""
+    run = run_of(monkeypatch, tmp_path / "run", step=5, bank=bank_of(), task="new-views")
+    with pytest.raises(ValueError, match=r"expected a run of fillerbuster-masked or nerfiller-grid, got one of"):
+        Masked(runs=(run,)).run()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"iterations": 0}, "iterations: expected 1 to 1e"),
+        ({"normals_from": -1}, "normals-from: expected 0 to 1e"),
+        ({"inpainter_weights": Path("nowhere")}, "inpainter-weights: no folder nowhere; give the diffusers folder"),
+        ({"lpips": Path("nowhere.pth")}, "SqueezeNet 1.1 in the file nowhere.pth, which is missing"),
+        ({"model": Path("nowhere")}, "nowhere"),
+    ],
+)
+def test_what_would_end_after_the_trainings_is_told_before_them(options, said, tiny_capture: Path, tmp_path: Path):
+    with pytest.raises(ValueError, match=said):
+        Paper(data=tiny_capture, output=tmp_path / "out", **options).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_scales_beyond_the_photos_are_refused(tiny_capture: Path):
     for scale in (0.0, 2.0, float("nan")):
         with pytest.raises(ValueError, match="scale: expected a part of the photos' sides above 0 and up to 1, got"):
             Paper(data=tiny_capture, scale=scale).run()

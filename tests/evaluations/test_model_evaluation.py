@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.folders.colmap_files import colmap_capture
 from helpers.tiny_models import save_tiny_model, tiny_model
 
+from fb_core.data.capture.captures import read_capture
 from fb_core.data.training.capture_sequences import CaptureConfig
 from fb_core.evaluation import ablations, conditioning
 from fb_core.evaluation.ablations import Asked, conditional_validation_loss, sequence_scores
@@ -67,6 +69,22 @@ def test_datasets_as_they_lie_on_disk(layout: str, tiny_capture: Path, tmp_path:
     assert torch.equal(views.images, views_of(tiny_capture, seed=1).images) and 0 < float(views.truth.mean()) < 1
 
 
+def test_colmap_captures_are_asked_as_they_lie_on_disk(tiny_capture: Path, tmp_path: Path):
+    """Mip-NeRF 360's layout: sparse/0 and images, several scenes in a folder."""
+    for scene in ("garden", "kitchen"):
+        colmap_capture(tmp_path / "360" / scene, read_capture(tiny_capture))
+    folders = capture_folders(tmp_path / "360")
+    captures = readable_captures(folders, views=4)
+    assert [name for name, _ in captures] == ["garden", "kitchen"]
+    views = drawn_views(captures, 4, CaptureConfig(image_size=32), generator=torch.Generator().manual_seed(1))
+    assert views.capture in ("garden", "kitchen") and float(views.truth.mean()) == 1
+    table = tmp_path / "table.json"
+    model = save_tiny_model(tmp_path / "model")
+    options = {"lengths": (4,), "sequences": 1, "times": 1, "steps": 1, "json": table}
+    ModelOnCaptures(data=tmp_path / "360", models=(model,), **options).run()
+    assert json.loads(table.read_text())["rows"][0]["part"] == "360, 32 pixels, 1 sequences"
+
+
 def test_what_is_not_true_does_not_count(tiny_capture: Path, tmp_path: Path, monkeypatch):
     """An error of 0.1 in true pixels is 20 dB, whatever stands where nobody knows the truth."""
     views = views_of(tiny_capture)
@@ -90,7 +108,14 @@ def test_several_models_in_one_table_and_nothing_twice(tiny_capture: Path, tmp_p
     suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
     files = {name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()}
     shutil.copytree(tiny_capture, tmp_path / "captures" / "a" / "b")
-    options = {"data": tmp_path / "captures", "models": models, "lengths": (4,), "sequences": 2, "times": 2, "steps": 1}
+    options = {
+        "data": tmp_path / "captures",
+        "models": models,
+        "lengths": (4, 4),
+        "sequences": 2,
+        "times": 2,
+        "steps": 1,
+    }
     command = ModelOnCaptures(**options, keep=tmp_path / "kept", **files)
     command.run()
     rows = json.loads(files["json"].read_text())["rows"]
@@ -125,6 +150,12 @@ def test_bad_data_is_told(tiny_capture: Path, tmp_path: Path):
         ModelOnCaptures(data=tiny_capture, lengths=(8,)).run()
     with pytest.raises(ValueError, match="lengths of 4 or more views"):
         ModelOnCaptures(lengths=(3,)).run()
+    with pytest.raises(ValueError, match="lengths: expected 4 to 10000, got 100000"):
+        ModelOnCaptures(lengths=(8, 10**5)).run()
+    with pytest.raises(ValueError, match="size: expected 16 to 8192, got -64"):
+        ModelOnCaptures(size=-64).run()
+    with pytest.raises(ValueError, match="known and hidden views together: expected 2 to 10000, got 100008"):
+        Conditioning(data=tiny_capture, known=(10**5,)).run()
     with pytest.raises(ValueError, match="which is none; check the path"):
         capture_folders(tmp_path / "nowhere")
 
@@ -143,7 +174,7 @@ def test_the_same_hidden_views_from_more_and_more_known_ones(tiny_capture: Path,
     options = {
         "data": tiny_capture,
         "model": folder,
-        "known": (1, 4),
+        "known": (1, 4, 4),
         "hidden": 2,
         "sequences": 2,
         "steps": 1,

@@ -128,7 +128,7 @@ def path_cameras(
             _outward(places, angles, curve.center if isinstance(curve, Ellipse) else shape.center, shape.up),
         ),
         up=shape.up,
-        fov_degrees=fov_degrees or square_fov_degrees(cameras),
+        fov_degrees=square_fov_degrees(cameras) if fov_degrees is None else fov_degrees,
         width=size,
         height=size,
     )

@@ -216,7 +216,12 @@ def test_the_command_judges_a_run_writes_all_files_and_goes_on(monkeypatch, tmp_
     assert {"command", "commit", "hardware", "seed"} <= set(content)
     row = content["rows"][0]
     assert row["method"] == "fillerbuster" and row["rra_5"] >= 0.8 and "SIFT" in row["part"]
-    assert next(csv.DictReader(files["csv"].open()))["method"] == "fillerbuster"
+    line = next(csv.DictReader(files["csv"].open()))
+    assert line["method"] == "fillerbuster"
+    assert {name: line[name] for name in ("command", "commit", "hardware")} == {
+        name: content[name] for name in ("command", "commit", "hardware")
+    }
+    assert line["seed"] == "0" == str(content["seed"])
     assert "| fillerbuster |" in files["markdown"].read_text() and files["figure"].stat().st_size > 1000
 
     def never(run):
@@ -255,6 +260,11 @@ def test_a_procedural_room_is_also_judged_as_it_is(tmp_path: Path):
         ({"runs": ()}, "expected one or more folders of runs"),
         ({"size": 8}, "got seconds 10, fps 24, size 8"),
         ({"fps": 0.0}, "fps 0,"),
+        ({"fps": math.inf}, "frames of the film, seconds times fps: expected 1 to 10000, got inf"),
+        ({"seconds": 1e9}, "frames of the film, seconds times fps: expected 1 to 10000, got 2.4e"),
+        ({"size": 10**6}, "size: expected 32 to 8192, got 1000000"),
+        ({"fov": 0.0}, "fov: expected 1 to 179, got 0"),
+        ({"fov": math.nan}, "fov: expected 1 to 179, got nan"),
     ],
 )
 def test_bad_options_are_told(options, said, tmp_path: Path):

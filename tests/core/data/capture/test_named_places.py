@@ -126,6 +126,27 @@ def test_results_spare_runs_captures_and_models(tiny_capture: Path, tmp_path: Pa
     assert files(tmp_path) == before
 
 
+def test_results_that_could_not_be_written_are_refused_before_anything_is_measured(tmp_path: Path, capsys):
+    (tmp_path / "note.txt").write_text("mine")
+    below, one = tmp_path / "note.txt" / "table.json", tmp_path / "one.png"
+    for option in ("--json", "--csv", "--markdown", "--figure"):
+        assert "note.txt is a file; choose another place" in refusal(capsys, "bench", "inference", option, below)
+    assert "note.txt is a file; choose another place" in refusal(
+        capsys, "eval", "consistency", tmp_path, "--keep", tmp_path / "note.txt"
+    )
+    assert "note.txt is a file; choose another place" in refusal(
+        capsys, "bench", "paper", "--data", tmp_path, "--output", tmp_path / "note.txt"
+    )
+    for name in ("figure", "figure.xyz", "figure.json"):
+        said = refusal(capsys, "bench", "inference", "--figure", tmp_path / name)
+        assert f"figure: expected a name that ends with .png, .svg, .pdf, got {name}; rename it" in said
+    said = refusal(capsys, "eval", "conditioning", "--data", tmp_path, "--sheet", tmp_path / "sheet.pdf")
+    assert "sheet: expected a name that ends with .png, got sheet.pdf" in said
+    said = refusal(capsys, "bench", "inference", "--json", one, "--figure", one)
+    assert "figure: " in said and "is the place of --json already; choose another name" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["note.txt"]
+
+
 # ---- folders --------------------------------------------------------------------------------------------------------
 
 
