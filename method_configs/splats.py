@@ -86,9 +86,7 @@ def _trainer() -> TrainerConfig:
             datamanager=FillerbusterDataManagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
-                # Splats of some hundred steps tell what is seen better than the cameras alone; captured views stay in
-                # the majority.
-                completion=CompletionConfig(at_step=500, generated_share=0.3, trust="measured"),
+                completion=CompletionConfig(),
             ),
             model=_model(),
         ),

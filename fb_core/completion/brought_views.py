@@ -7,18 +7,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import BROUGHT, CompletedViews, Origin
-from fb_core.completion.rounds import fitted_rectangle
 from fb_core.data.capture.captures import TRUST_KEY
 from fb_core.data.capture.frames import Frame
 from fb_core.data.media import read_image, resize
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.square_fit import SquareFit
 from fb_core.masks import wholly_known
 
 
@@ -76,10 +75,9 @@ def _fitted(
     picture: Float[Tensor, "4 h w"], camera: Pinholes, side: int
 ) -> tuple[Float[Tensor, "4 side side"], Pinholes]:
     """Colours and mask in the middle of a square; the mask is 0 around them."""
-    left, top, width, height = fitted_rectangle(camera.height, camera.width, side)
-    pads = (left, side - width - left, top, side - height - top)
-    fitted = torch.cat(wholly_known(picture[:3], picture[3:], lambda channels: resize(channels, height, width)))
-    return F.pad(fitted, pads), camera.to(torch.float32).scaled(width, height).cropped(-left, -top, side, side)
+    fit = SquareFit.of(camera.height, camera.width, side)
+    scaled = torch.cat(wholly_known(picture[:3], picture[3:], lambda channels: resize(channels, fit.height, fit.width)))
+    return fit.framed(scaled), fit.camera(camera.to(torch.float32))
 
 
 def _trust(frame: Frame, side: int) -> tuple[UInt8[Tensor, "side side 1"] | None, UInt8[Tensor, "side side 1"]]:
@@ -94,22 +92,11 @@ def _trust(frame: Frame, side: int) -> tuple[UInt8[Tensor, "side side 1"] | None
     ):
         return None, whole
     picture = read_image(root / told)[:1]
-    left, top, width, height = fitted_rectangle(picture.shape[1], picture.shape[2], side)
-    pads = (left, side - width - left, top, side - height - top)
-    fitted = F.pad(resize(picture, height, width).clamp(0, 1), pads)
+    fit = SquareFit.of(picture.shape[1], picture.shape[2], side)
+    fitted = fit.framed(resize(picture, fit.height, fit.width).clamp(0, 1))
     return (fitted * 255).round().to(torch.uint8).movedim(0, -1).contiguous(), whole
 
 
 def _origin(frame: Frame, number: int) -> Origin:
-    """What the frame says of its own origin, as far as it does."""
-    told = frame.extra
-    seed, aspect, trust = told.get("seed"), told.get("aspect"), told.get("trust")
-    return Origin(
-        role=BROUGHT,
-        round=number,
-        seed=seed if isinstance(seed, int) else 0,
-        prompt=str(told.get("prompt") or ""),
-        model_hash=str(told.get("model_hash") or ""),
-        aspect=float(aspect) if isinstance(aspect, int | float) else frame.camera.width / frame.camera.height,
-        trust=float(trust) if isinstance(trust, int | float) and 0 <= trust <= 1 else 1.0,
-    )
+    aspect = frame.camera.width / frame.camera.height
+    return Origin.from_record(frame.extra, role=BROUGHT, round_number=number, aspect=aspect)

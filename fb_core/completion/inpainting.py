@@ -25,7 +25,6 @@ from fb_core.completion.rounds import (
     Named,
     RoundMaker,
     expectation,
-    fitted_rectangle,
     fitted_view,
     model_name,
     open_cache,
@@ -33,6 +32,7 @@ from fb_core.completion.rounds import (
 from fb_core.completion.samples import Inpainter
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.square_fit import SquareFit
 from fb_core.geometry.viewpoints.paths import CaptureShape, strided_subset
 from fb_core.masks import grow_hole
 from fb_core.views import Views
@@ -137,8 +137,7 @@ def pasted(view: CapturedView, square: Float[Tensor, "3 s s"]) -> Float[Tensor, 
     known pixels.
     """
     _, height, width = view.image.shape
-    left, top, across, down = fitted_rectangle(height, width, square.shape[-1])
-    content = square[None, :, top : top + down, left : left + across]
+    content = SquareFit.of(height, width, square.shape[-1]).cut(square)[None]
     generated = F.interpolate(content, size=(height, width), mode="bicubic", antialias=True, align_corners=False).clamp(
         0, 1
     )
@@ -192,8 +191,7 @@ def _refuse_nothing_to_do(told: Sequence[_Told]) -> None:
 
 
 def _fitted_camera(camera: Pinholes, size: int) -> Pinholes:
-    left, top, across, down = fitted_rectangle(camera.height, camera.width, size)
-    return camera.scaled(across, down).cropped(-left, -top, size, size)
+    return SquareFit.of(camera.height, camera.width, size).camera(camera)
 
 
 def _copy(

@@ -81,9 +81,9 @@ class CompletionConfig:
     """What is to be seen, for models that read text."""
     text_encoder: Path | None = None
     """Folder of the CLIP text model, which a prompt needs."""
-    at_step: int = 0
-    """Training step before which the views are generated. Later, the splats themselves show what is seen and how far it
-    is.
+    at_step: int = 500
+    """Training step before which the views are generated. Splats of some hundred steps tell what is seen, and how far
+    it is, better than the cameras alone.
     """
     context_views: int = 16
     """Captured views that the model is conditioned on; fewer when the capture has fewer."""
@@ -170,7 +170,7 @@ class CompletionConfig:
     """Decides cameras, images, and which training steps draw generated views."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Where the new cameras stand and look."""
-    generated_share: float = 0.5
+    generated_share: float = 0.3
     """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn
     equally often.
     """
@@ -182,7 +182,7 @@ class CompletionConfig:
     """Shift the colours of generated views smoothly so that they meet the splats' where the capture has seen them."""
     view_weight: float = 1.0
     """Weight of a generated view's loss; captured views have 1."""
-    trust: Literal["full", "measured"] = "full"
+    trust: Literal["full", "measured"] = "measured"
     """Count generated views in full, or as far as the model is right about a few captured views that are hidden from it
     first.
     """

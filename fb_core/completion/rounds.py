@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -24,6 +23,7 @@ from fb_core.completion.results.completed_views import ANCHOR, CompletedViews, O
 from fb_core.completion.samples import Inpainter, Question, Samples, draw
 from fb_core.data.media import resize
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.square_fit import SquareFit
 from fb_core.inpainter import SamplingConfig
 from fb_core.masks import wholly_known
 from fb_core.views import Views
@@ -34,7 +34,7 @@ __all__ = [
     "CompletionConfig",
     "CompletionPlan",
     "PlacementConfig",
-    "announcement",
+    "announcement_of_rounds",
     "fitted_view",
     "plan_completion",
     "run_completion",
@@ -198,23 +198,12 @@ def fitted_view(view: CapturedView, size: int) -> Views:
     nor matter; a resampled pixel is known when all that it was made from is known.
     """
     _, height, width = view.image.shape
-    left, top, new_width, new_height = fitted_rectangle(height, width, size)
-    image, known = wholly_known(view.image, view.known, lambda channels: resize(channels, new_height, new_width))
-    pads = (left, size - new_width - left, top, size - new_height - top)
-    camera = view.camera.scaled(new_width, new_height).cropped(-left, -top, size, size)
-    return Views.known(F.pad(image, pads)[None], camera, mask=F.pad(known, pads)[None])
+    fit = SquareFit.of(height, width, size)
+    image, known = wholly_known(view.image, view.known, lambda channels: resize(channels, fit.height, fit.width))
+    return Views.known(fit.framed(image)[None], fit.camera(view.camera), mask=fit.framed(known)[None])
 
 
-def fitted_rectangle(height: float, width: float, size: int) -> tuple[int, int, int, int]:
-    """Where in a square a picture stands whose long side is scaled to the square's: left, top, width, height in
-    pixels.
-    """
-    scale = size / max(height, width)
-    new_height, new_width = max(1, round(height * scale)), max(1, round(width * scale))
-    return (size - new_width) // 2, (size - new_height) // 2, new_width, new_height
-
-
-def announcement(
+def announcement_of_rounds(
     plan: CompletionPlan, config: CompletionConfig, model: Inpainter, *, done: CompletedViews | None = None
 ) -> str:
     """One sentence on what is about to be generated, and on what an interrupted run (``done``) has left; two where the
@@ -269,10 +258,8 @@ def expectation(sequences: Sequence[tuple[int, int]], size: int, config: Complet
 
 def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:
     """True in the largest rectangle of an aspect (width over height) in the middle of a square."""
-    left, top, width, height = fitted_rectangle(*((1.0, aspect) if aspect > 1 else (1 / aspect, 1.0)), size)
-    mask = torch.zeros(1, size, size, 1, dtype=torch.bool)
-    mask[:, top : top + height, left : left + width] = True
-    return mask
+    fit = SquareFit.of(*((1.0, aspect) if aspect > 1 else (1 / aspect, 1.0)), size)
+    return fit.framed(torch.ones(1, fit.height, fit.width, dtype=torch.bool))[..., None]
 
 
 def model_name(config: CompletionConfig, model: Inpainter) -> str:

@@ -21,10 +21,11 @@ from torch import Tensor
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.pixel_trust import LEAST, Curve, evidence_of, fitted_curve
 from fb_core.completion.results.cache import CompletionCache
-from fb_core.completion.rounds import CapturedView, fitted_rectangle, fitted_view
+from fb_core.completion.rounds import CapturedView, fitted_view
 from fb_core.completion.samples import Inpainter, Question, Samples, draw, in_8_bits, variance_of
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import Carried, carried_over
+from fb_core.geometry.square_fit import SquareFit
 from fb_core.views import Views
 
 _FEWEST = 4  # context views: of fewer, none can be spared
@@ -286,8 +287,7 @@ def along_rays(depth: Float[Tensor, "n h w"], cameras: Pinholes) -> Float[Tensor
 
 def fitted_camera(view: CapturedView, size: int) -> Pinholes:
     """The camera of :func:`fitted_view`."""
-    left, top, width, height = fitted_rectangle(view.image.shape[1], view.image.shape[2], size)
-    return view.camera.scaled(width, height).cropped(-left, -top, size, size)
+    return SquareFit.of(view.image.shape[1], view.image.shape[2], size).camera(view.camera)
 
 
 def _generated(

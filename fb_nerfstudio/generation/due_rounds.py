@@ -14,7 +14,7 @@ from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import CompletionPlan, plan_completion
 from fb_core.completion.requests import merged
 from fb_core.completion.results.completed_views import CompletedViews
-from fb_core.completion.rounds import CapturedView, announcement, open_cache, run_completion
+from fb_core.completion.rounds import CapturedView, announcement_of_rounds, open_cache, run_completion
 from fb_core.completion.samples import Inpainter
 from fb_core.completion.trust import Trust, measured_trust
 from fb_core.data.capture.frames import Frame
@@ -112,10 +112,10 @@ def _with_model(generation: Generation, scene: TrainedScene) -> CompletionPlan:
         plan, announce = plan_inpainting(scene.cameras, points, config, size=size), announcement_of_inpainting
     else:
         plan = _plan(generation, scene, size=size)
-        announce = partial(announcement, done=state.automatic_views)
+        announce = partial(announcement_of_rounds, done=state.automatic_views)
     generation.panel.coverage.show(plan)
     if not plan.rounds and plan.covered is not None:
-        CONSOLE.print(announcement(plan, config, model))
+        CONSOLE.print(announcement_of_rounds(plan, config, model))
     if plan.rounds:
         with refusing():
             CONSOLE.print(announce(plan, config, model))

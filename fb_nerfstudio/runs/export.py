@@ -8,7 +8,6 @@ number.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from fb_core.data import media
 from fb_core.data.capture.captures import TRUST_KEY, split_lists, splits_of, write_transforms
 from fb_core.data.capture.colmap.model import ColmapImage, write_colmap
 from fb_core.data.capture.frames import Capture, Frame
+from fb_core.data.capture.layouts import PROVENANCE_NAME
 from fb_core.data.capture.own_files import own_pictures, own_points
 from fb_core.data.capture.point_cloud import Points
 from fb_core.data.capture.points import copy_points, read_points, write_points
@@ -27,8 +27,6 @@ from fb_core.files.whole import whole_folder
 from fb_nerfstudio.runs.saved_run import CompletedCapture
 
 KIND = "export"
-PROVENANCE_NAME = "frames.json"
-"""Beside a COLMAP model, which has no room for it: what is known of every picture, by its name."""
 _COLMAP_FOLDER = Path("sparse/0")
 _LENS_EXTRAS = ("distortion_params", "fisheye_crop_radius")  # of the bent pictures
 _MODEL = "PINHOLE"
@@ -112,7 +110,7 @@ def _generated_frames(completed: CompletedCapture, folder: Path, *, masked: bool
         media.write_image(target, views.images[index].movedim(-1, 0).float() / 255)
         if masked:
             media.write_image(_mask_path(target), views.masks[index].movedim(-1, 0).float())
-        extra = {"generated": True, **dataclasses.asdict(origin)}
+        extra = origin.record()
         if views.trust is not None:
             extra[TRUST_KEY] = f"trust/{target.stem}.png"
             (folder / "trust").mkdir(exist_ok=True)

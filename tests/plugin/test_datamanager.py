@@ -1,19 +1,14 @@
-"""The datamanager in process at toy size: generation when due, mixing, persistence, resume, refusals, the viewer
-panel.
-"""
+"""The datamanager in process at toy size: generation when due, mixing, persistence, resume."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from helpers.plugin.datamanagers import (
     GreyFiller,
     ToySplats,
@@ -24,19 +19,13 @@ from helpers.plugin.datamanagers import (
     options,
     run_callbacks,
     stand_in_model,  # noqa: F401
-    toy_viewer,
-    two_views,
 )
 
-from fb_core.completion.options import CompletionConfig, PlacementConfig
+from fb_core.completion.options import PlacementConfig
 from fb_core.completion.planning.plan import plan_completion
-from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.data.capture.captures import validate_capture
-from fb_core.geometry.shell import sphere
-from fb_core.views import Views
-from fb_nerfstudio.capture.splat_renders import Rendered, surface_points
-from fb_nerfstudio.capture.unseen import find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
-from fb_nerfstudio.datamanager import FillerbusterDataManager, FillerbusterDataManagerConfig, Refused
+from fb_nerfstudio.capture.splat_renders import surface_points
+from fb_nerfstudio.datamanager import Refused
 
 
 @pytest.mark.parametrize(
@@ -304,76 +293,6 @@ def test_evaluation_commands_restore_the_bank_without_the_model(tiny_capture: Pa
     assert len(manager.generated_views) == 6 and GreyFiller.loads == loads
 
 
-@pytest.fixture()
-def starts(monkeypatch) -> list[tuple[Views | None, float]]:
-    """What each generation starts from, and its strength; the stand-in answers as ever."""
-    given, complete = [], GreyFiller.complete
-
-    def watched(self, views, *, sampling, current=None, **options):
-        given.append((current, sampling.strength))
-        return complete(self, views, sampling=sampling, **options)
-
-    monkeypatch.setattr(GreyFiller, "complete", watched)
-    return given
-
-
-def test_generation_starts_from_what_the_splats_show_where_they_are_firm(tiny_capture: Path, starts):
-    """Their left half is a grey wall; latents at its edge are told wholly, everything else is left to noise."""
-    generated(make(tiny_capture, options(at_step=200, start="render", strength=0.4)), step=200)
-    (anchors, strength), (densified, _) = starts
-    assert strength == 0.4 and len(anchors) == 3 + 4 and len(densified) == 3 + 4 + 2
-    new = anchors[[3, 4, 5, 6]]
-    assert bool((new.image_known[..., :12] == 1).all()) and not bool(new.image_known[..., 12:].any())
-    assert torch.allclose(new.images[..., :12], torch.tensor(0.5), atol=1 / 255)
-    assert not bool(anchors[[0, 1, 2]].image_known.all()), "the margins of fitted photos are not told"
-
-
-@pytest.mark.parametrize(
-    ("options_of_start", "step"),
-    [({"start": "noise"}, 200), ({"start": "render", "strength": 1.0}, 200), ({"start": "render"}, 0)],
-)
-def test_generation_starts_from_noise_when_asked_at_strength_one_and_before_anything_is_trained(
-    tiny_capture: Path, starts, options_of_start, step
-):
-    generated(make(tiny_capture, options(at_step=step, **options_of_start)), step=step)
-    assert starts == [(None, 1.0)] * 2
-
-
-def test_fog_and_emptiness_leave_generation_to_noise(tiny_capture: Path, starts, monkeypatch):
-    """To the bit: what the model is given does not differ, nor do the views."""
-    shown = ToySplats.get_outputs_for_camera
-    wanted = generated(
-        make(tiny_capture, options(at_step=200, start="noise", match_colors=False)), step=200
-    ).pipeline.datamanager.generated_views
-    for opacity in (0.0, 0.7):
-        fog = {"accumulation": torch.full((16, 16, 1), opacity), "rgb": torch.rand(16, 16, 3)}
-        monkeypatch.setattr(
-            ToySplats,
-            "get_outputs_for_camera",
-            lambda self, one, fog=fog: shown(self, one) | (fog if int(one.width) == 16 else {}),
-        )
-        starts.clear()
-        got = generated(
-            make(tiny_capture, options(at_step=200, start="render", match_colors=False)), step=200
-        ).pipeline.datamanager
-        assert starts == [(None, 1.0)] * 2
-        assert torch.equal(got.generated_views.images, wanted.images)
-
-
-def test_a_run_that_goes_on_starts_its_rounds_where_the_whole_run_did(tiny_capture: Path, tmp_path: Path, starts):
-    whole = make(tiny_capture, options(at_step=200, start="render"))
-    generated(whole, tmp_path, step=200)
-    state = whole.state_dict()
-    kept = CompletedViews.from_state(state["_extra_state"]["views"]).of_round(0)
-    state["_extra_state"] |= {"views": kept.state(), "finished": False}
-    resumed = make(tiny_capture, options(at_step=200, start="render"))
-    resumed.load_state_dict(state, strict=False)
-    generated(resumed, tmp_path, step=200)
-    assert len(starts) == 3
-    for field in dataclasses.fields(Views):
-        assert torch.equal(getattr(starts[2][0], field.name)[-2:], getattr(starts[1][0], field.name)[-2:])
-
-
 def test_untrained_splats_are_not_asked_what_was_seen(tiny_capture: Path):
     manager = make(tiny_capture)
     attrs = generated(manager, step=0)
@@ -430,169 +349,3 @@ def test_training_on_unseen_pixels_alone_masks_the_rest(tiny_capture: Path):
     generated(manager)
     masks = manager.generated_views.masks
     assert 0 < int(masks.sum()) < masks.numel()
-
-
-def test_several_processes_are_refused(tiny_capture: Path):
-    with pytest.raises(ValueError, match="one process, got 2"):
-        FillerbusterDataManagerConfig(data=tiny_capture).setup(device="cpu", world_size=2)
-
-
-def test_a_broken_capture_is_refused_before_anything_is_loaded(tiny_capture: Path):
-    next((tiny_capture / "images").iterdir()).unlink()
-    with pytest.raises(Refused, match=r"view_\d+"):
-        make(tiny_capture)
-    with pytest.raises(ValueError, match="no such folder"):
-        make(tiny_capture / "nowhere")
-    (tiny_capture / "transforms.json").write_text("{")
-    with pytest.raises(ValueError, match="JSON"):
-        make(tiny_capture)
-
-
-def test_a_refusal_ends_a_command_with_its_sentence_and_code_one():
-    # The class itself, without the seconds that importing nerfstudio takes.
-    program = "class Refused(SystemExit, ValueError): pass\nraise Refused('the capture is empty')"
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (1, "the capture is empty\n")
-    assert issubclass(Refused, SystemExit) and issubclass(Refused, ValueError)
-
-
-def test_a_bad_model_folder_is_refused_before_training(tiny_capture: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.undo()
-    manager = make(tiny_capture, options(model=tmp_path / "absent", at_step=1000))
-    with pytest.raises(Refused, match="absent"):
-        manager.get_training_callbacks(attributes(manager))
-
-
-def test_points_of_the_capture_come_without_open3d(tiny_capture: Path):
-    manager = make(tiny_capture)
-    outputs = manager.train_dataparser_outputs
-    points, colors = outputs.metadata["points3D_xyz"], outputs.metadata["points3D_rgb"]
-    assert points.shape == colors.shape == (50, 3) and colors.dtype == torch.uint8 and points.dtype == torch.float32
-    # Cameras and points went through one similarity: their distances keep their ratios.
-    before, after = validate_capture(tiny_capture), manager.train_dataset.cameras.camera_to_worlds[:, :, 3]
-    import trimesh
-
-    original = torch.from_numpy(trimesh.load(before.points_path).vertices.copy()).float()
-    names = [path.name for path in outputs.image_filenames]
-    place = {frame.image_path.name: frame.camera.centers[0].float() for frame in before.frames}
-    centers = torch.stack([place[name] for name in names])
-    ratio = torch.cdist(after, points) / torch.cdist(centers, original)
-    assert torch.allclose(ratio, torch.full_like(ratio, outputs.dataparser_scale), rtol=1e-4)
-
-
-def test_images_are_not_pinned_without_a_driver(tiny_capture: Path, monkeypatch):
-    def pinned(_):
-        raise RuntimeError("no driver")
-
-    monkeypatch.setattr(torch.Tensor, "pin_memory", pinned)
-    manager = make(tiny_capture, cache_images="cpu")  # what nerfstudio switches to beyond 500 images
-    assert len(manager.cached_train) == 6
-    manager.next_train(0)
-
-
-def test_the_config_survives_nerfstudios_yaml(tiny_capture: Path):
-    config = FillerbusterDataManagerConfig(data=tiny_capture, completion=options(model=Path("weights"), seed=7))
-    back = yaml.load(yaml.dump(config), Loader=yaml.Loader)
-    assert dataclasses.asdict(back.completion) == dataclasses.asdict(config.completion)
-    assert back._target is FillerbusterDataManager
-
-
-def test_every_option_is_a_flag_with_a_description(capsys):
-    import tyro
-
-    parsed = tyro.cli(
-        CompletionConfig, args=["--anchor-views", "3", "--placement.radius", "0.5", "--model", "somewhere"]
-    )
-    assert parsed.anchor_views == 3 and parsed.placement.radius == 0.5 and parsed.model == Path("somewhere")
-    with pytest.raises(SystemExit):
-        tyro.cli(CompletionConfig, args=["--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    for field in dataclasses.fields(CompletionConfig):
-        assert field.name == "placement" or f"--{field.name.replace('_', '-')}" in text
-    assert "Views generated together in the first round" in text
-
-
-# ---- unseen pixels --------------------------------------------------------------------------------------------------
-
-
-def test_the_captured_direction_is_seen_and_the_other_is_not():
-    views = two_views()
-    captured = dataclasses.replace(views.cameras[0], focal=views.cameras.focal[:1] / 2)  # looks the same way, wider
-    unseen = find_unseen(views.cameras, [captured], sphere(torch.zeros(3), 3.0), None)
-    assert not unseen.mask[0].any() and unseen.mask[1].all()
-    assert torch.allclose(unseen.points.norm(dim=-1), torch.tensor(3.0), atol=1e-3)
-    points, colors = unseen_gaussians(views, unseen, limit=10, generator=torch.Generator().manual_seed(0))
-    assert points.shape == (10, 3) and bool((points[:, 0] < 0).all()) and torch.allclose(colors, torch.tensor(0.2))
-    masked = with_unseen_masks(views, unseen)
-    assert not masked.masks[0].any() and masked.masks[1].all()
-
-
-def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at():
-    views = two_views()
-    captured = dataclasses.replace(views.cameras[0], focal=views.cameras.focal[:1] / 2)
-    accumulation = torch.ones(2, 8, 8)
-    accumulation[0, :, 4:] = 0.1
-    rendered = Rendered(depth=torch.full((2, 8, 8), 2.0), accumulation=accumulation, rgb=torch.full((2, 3, 8, 8), 0.5))
-    unseen = find_unseen(views.cameras, [captured], sphere(torch.zeros(3), 3.0), rendered)
-    matched = with_matched_colors(views, unseen, rendered).images.float() / 255
-    assert float((matched[0, :, :4] - 0.5).abs().max()) < 0.01, "what is seen has the splats' colour"
-    assert torch.equal(with_matched_colors(views, unseen, rendered).images[1], views.images[1]), (
-        "nothing seen, nothing changed"
-    )
-    assert not unseen.mask[0, :, :4].any() and unseen.mask[0, :, 4:].all() and unseen.mask[1].all()
-    masked = with_unseen_masks(views, unseen)
-    assert masked.masks[0, :, 4:].all() and not masked.masks[0, :, :4].any()
-
-
-# ---- viewer ---------------------------------------------------------------------------------------------------------
-
-
-def test_without_a_viewer_the_panel_does_nothing(tiny_capture: Path):
-    manager = make(tiny_capture)
-    generated(manager)
-    assert not manager.completion_panel.is_open
-
-
-def test_frustums_stand_in_one_group_per_round_with_a_switch_each(tiny_capture: Path):
-    manager, viewer = make(tiny_capture), toy_viewer()
-    manager.completion_panel._setup(viewer)
-    server = viewer.viser_server
-    assert list(server.boxes) == ["Captured (6)"] and "No generated" in server.status.content
-    assert "Nothing trains here" in server.status.content and all(field.disabled for field in server.fields.values())
-    generated(manager)
-    assert list(server.boxes) == ["Captured (6)", "Anchors (4)", "Round 1 (2)"]
-    assert len([name for name in server.nodes if "view_" in name]) == 6
-    assert server.status.content == "6 generated views"
-    server.switch("Anchors (4)", False)
-    assert not server.nodes["/completion/round_00"].visible and server.nodes["/completion/round_01"].visible
-    server.switch("Captured (6)", False)
-    assert viewer.visible == [False]
-    frustum, camera = server.nodes["/completion/round_00/view_000"], manager.generated_views.cameras
-    assert torch.allclose(torch.from_numpy(frustum.position).float(), 10 * camera.centers[0], atol=1e-5)
-    assert frustum.image.shape == (16, 16, 3)
-
-
-def test_a_saved_run_is_drawn_whether_the_viewer_comes_first_or_last(tiny_capture: Path):
-    trained = make(tiny_capture)
-    generated(trained)
-    state = trained.state_dict()
-    for viewer_first in (True, False):
-        manager, viewer = make(tiny_capture, test_mode="test"), toy_viewer()
-        if viewer_first:  # ns-train --load-dir
-            manager.completion_panel._setup(viewer)
-        manager.load_state_dict(state, strict=False)
-        if not viewer_first:  # ns-viewer
-            manager.completion_panel._setup(viewer)
-        assert len([name for name in viewer.viser_server.nodes if "view_" in name]) == 6
-        manager.generation.set_views(None)
-        assert viewer.viser_server.nodes == {}
-
-
-def test_nerfstudios_viewer_finds_the_panel(tiny_capture: Path):
-    from nerfstudio.viewer.utils import parse_object
-    from nerfstudio.viewer.viewer_elements import ViewerControl
-
-    manager = make(tiny_capture)
-    holder = torch.nn.Module()
-    holder.datamanager = manager
-    assert [found for _, found in parse_object(holder, ViewerControl, "Custom Elements")] == [manager.completion_panel]

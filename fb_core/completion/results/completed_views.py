@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from fb_core.files.ownership import Target
 from fb_core.geometry.cameras import Pinholes
 
 ANCHOR, DENSIFY, REQUESTED, INPAINTED, BROUGHT = "anchor", "densify", "requested", "inpainted", "brought"
+FLY_THROUGH = "fly-through"
 UNSAMPLED = 255
 """Deviation of a single sample, which nobody knows."""
 _STATE_VERSION = 1
@@ -42,7 +43,8 @@ class Origin:
     role: str
     """``anchor`` (conditioned on the capture), ``densify`` or ``requested`` in the viewer (both on the capture and the
     anchors),
-    ``inpainted``: a captured picture with its unknown pixels filled, or ``brought`` along by the capture.
+    ``inpainted``: a captured picture with its unknown pixels filled, ``brought`` along by the capture, or
+    ``fly-through``: a picture of a film.
     """
     round: int
     """Pass of the diffusion model, counted from 0; the views of one pass were generated together."""
@@ -69,6 +71,26 @@ class Origin:
             )
         if not 0 <= self.trust <= 1:
             raise ValueError(f"Origin: expected a trust from 0 to 1, got {self.trust}")
+
+    def record(self) -> dict[str, Any]:
+        """What a capture's frame says of where it came from; every capture that is written says it so."""
+        return {"generated": True, **dataclasses.asdict(self)}
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any], *, role: str, round_number: int, aspect: float) -> Origin:
+        """What a frame says, as far as it does and as it makes sense; others may have written it. ``aspect`` is taken
+        where it names none.
+        """
+        seed, own_aspect, trust = record.get("seed"), record.get("aspect"), record.get("trust")
+        return Origin(
+            role=role,
+            round=round_number,
+            seed=seed if isinstance(seed, int) else 0,
+            prompt=str(record.get("prompt") or ""),
+            model_hash=str(record.get("model_hash") or ""),
+            aspect=float(own_aspect) if isinstance(own_aspect, int | float) else aspect,
+            trust=float(trust) if isinstance(trust, int | float) and 0 <= trust <= 1 else 1.0,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +250,7 @@ class CompletedViews:
                 mask=None if whole else masks[index],
                 trust=None if trust is None else trust[index],
                 camera=cameras[index],
-                extra={"generated": True, **dataclasses.asdict(origin)},
+                extra=origin.record(),
             )
             for index, origin in enumerate(self.origins)
         ]

@@ -46,7 +46,8 @@ _PICTURES = ("images", ".", "rgb", "input", "image", "resized_undistorted_images
 _UPWARDS = 4  # folders above a model in which its pictures are looked for
 _REDUCED = re.compile(r"images_(\d+)")
 _IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-_PROVENANCE = "frames.json"  # beside the COLMAP models of fillerbuster export
+PROVENANCE_NAME = "frames.json"
+"""Beside the COLMAP models of ``fillerbuster export``: what is known of each picture, by its name."""
 _COLMAP_EXPORT = "export the cameras as a COLMAP text model"
 _OTHER_TOOLS = (  # a file that tells the tool, the tool, what to do
     ("keyframes/cameras", "Polycam's raw data", "run ns-process-data polycam"),
@@ -352,7 +353,7 @@ def _lists(root: Path, pictures: Path, there: set[Path]) -> dict[str, list[str]]
 
 def _provenance(root: Path) -> dict[str, dict[str, Any]]:
     """What ``fillerbuster export`` has told of each picture: generated ones are no photos."""
-    path = root / _PROVENANCE
+    path = root / PROVENANCE_NAME
     try:
         told = read_json(path) if path.is_file() else {}
     except ValueError:

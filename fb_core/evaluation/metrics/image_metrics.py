@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fb_core.splatting import photometric
+
 SOLID = 0.5
 """Accumulation from which a pixel counts as covered by the scene; below, it is a hole."""
-_LEAST_ERROR = 1e-12  # identical pictures have 120 dB instead of infinity, which JSON cannot hold
-_SSIM_WINDOW = 11  # pixels; Wang et al. 2004
 
 
 def psnr(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
     """Peak signal-to-noise ratio of each view in dB, for values in [0, 1]; at most 120 dB."""
     _require_pairs(images, truth)
-    return -10 * (images - truth).square().mean(dim=(1, 2, 3)).clamp_min(_LEAST_ERROR).log10()
+    return photometric.decibels((images - truth).square().mean(dim=(1, 2, 3)))
 
 
 def ssim(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
@@ -24,19 +24,16 @@ def ssim(images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"]) -> F
 
     Raises ValueError for views with a side below 11 pixels, where no window fits.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
     _require_pairs(images, truth)
-    if min(images.shape[2:]) < _SSIM_WINDOW:
+    window = photometric.WINDOW
+    if min(images.shape[2:]) < window:
         raise ValueError(
-            f"ssim: expected views of at least {_SSIM_WINDOW} x {_SSIM_WINDOW} pixels, got {images.shape[3]} x "
-            f"{images.shape[2]}"
+            f"ssim: expected views of at least {window} x {window} pixels, got {images.shape[3]} x {images.shape[2]}"
         )
-    _, similarity = structural_similarity_index_measure(
-        images, truth, data_range=1.0, kernel_size=_SSIM_WINDOW, sigma=1.5, reduction="none", return_full_image=True
-    )
-    edge = _SSIM_WINDOW // 2  # torchmetrics also counts windows that hang over the border, the definition does not
-    return similarity[..., edge:-edge, edge:-edge].mean(dim=(1, 2, 3))
+    if len(images) == 0:
+        return images.new_zeros(0)
+    pairs = zip(images.movedim(1, -1), truth.movedim(1, -1), strict=True)
+    return torch.stack([photometric.ssim(image, true) for image, true in pairs])
 
 
 def hole_share(accumulation: Float[Tensor, "n h w"]) -> Float[Tensor, " n"]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from fb_core.data.training.task import Source, TaskConfig
 from fb_core.geometry.raymap import to_unit_range
 from fb_core.networks.vae import VAE
+from fb_core.splatting.photometric import decibels
 from fb_core.training.run.stage import Stage, row_generator
 from fb_core.training.stages.adversarial import PatchDiscriminator, discriminator_loss, generator_loss
 
@@ -158,7 +159,7 @@ def reconstruction_error(network: VAE, values: Float[Tensor, "b c h w"]) -> dict
     """How well values in [0, 1] survive: PSNR in dB for images, degrees and cube units for raymaps."""
     decoded = network.decode(network.encode(values), clamp=True)
     if values.shape[1] == 3:
-        return {"psnr": float(-10 * (decoded - values).square().mean().log10())}
+        return {"psnr": float(decibels((decoded - values).square().mean()))}
     from fb_core.geometry.raymap import from_unit_range
 
     true, got = from_unit_range(values), from_unit_range(decoded)

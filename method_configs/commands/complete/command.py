@@ -17,6 +17,7 @@ import torch
 from fb_core import checkpoint
 from fb_core.completion.duration import in_words
 from fb_core.completion.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
+from fb_core.completion.results.completed_views import FLY_THROUGH, Origin
 from fb_core.data.capture.camera_path import read_camera_path
 from fb_core.data.capture.captures import read_capture
 from fb_core.data.capture.own_files import own_points
@@ -37,7 +38,7 @@ from method_configs.commands.complete.forecast import forecast
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.output import KIND, NewViews, World, is_ours, write_folder, write_report
 from method_configs.commands.complete.plan import Plan, pose_sampling
-from method_configs.commands.complete.report import announcement, bars, no_cameras, report_of, what_was_found
+from method_configs.commands.complete.report import announcement_of_work, bars, no_cameras, report_of, what_was_found
 from method_configs.commands.complete.self_check import agreement
 
 _WORKING = {
@@ -274,7 +275,7 @@ def _work(
     plan = None if model is None or options.poses_only else Plan.of(len(job.photos), views, model, options)
     sampling = None if model is None else pose_sampling(model, options)
     expected = forecast(job.photos, options, model, plan, sampling)
-    _logger.info(announcement(job.photos, options, model, plan, sampling, expected))
+    _logger.info(announcement_of_work(job.photos, options, model, plan, sampling, expected))
     found = _find_cameras(job, options, model, clock)
     photos = found.as_used(job.photos)
     if plan is not None and len(found.trusted) >= FEWEST:
@@ -301,16 +302,16 @@ def _work(
             on_progress=on_progress,
         )
     number = {view: number for number, chosen in enumerate(plan.passes.views) for view in chosen}
-    origins = [
-        {
-            "role": "fly-through",
-            "round": number[view],
-            "seed": options.seed + number[view],
-            "prompt": options.prompt or "",
-            "model_hash": model.model_hash,
-        }
+    origins = tuple(
+        Origin(
+            role=FLY_THROUGH,
+            round=number[view],
+            seed=options.seed + number[view],
+            prompt=options.prompt or "",
+            model_hash=model.model_hash,
+        )
         for view in range(len(path))
-    ]
+    )
     told: dict[str, Any] = {
         "context": [job.photos[index].name for index in context],
         "passes": [len(chosen) for chosen in plan.passes.views],
@@ -351,7 +352,7 @@ def _work_on_scene(
     if found is None:
         sampling = None if model is None else pose_sampling(model, options)
         expected = forecast(job.photos, options, model, None, sampling)
-        _logger.info(announcement(job.photos, options, model, None, sampling, expected))
+        _logger.info(announcement_of_work(job.photos, options, model, None, sampling, expected))
         found = _find_cameras(job, options, model, clock)
         keep_cameras(work, found)
     else:

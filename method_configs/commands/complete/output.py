@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.completion.fly_through import FoundCameras
+from fb_core.completion.results.completed_views import Origin
 from fb_core.data import media
 from fb_core.data.capture.captures import split_lists, write_transforms
 from fb_core.data.capture.frames import Capture, Frame
@@ -94,8 +95,8 @@ class NewViews:
     """1 where the picture is to be trained on; None is everywhere."""
     cameras: Pinholes
     """Square, in the photos' world."""
-    origins: list[dict[str, Any]]
-    """What each frame says of where it came from."""
+    origins: tuple[Origin, ...]
+    """Where each of them came from."""
     film: FilmFiles | None = None
     """The film of the scene's splats; None where the generated views are the film."""
 
@@ -257,7 +258,7 @@ def _generated_frames(folder: Path, new: NewViews, taken: set[str], masked: bool
                 mask_path=_write_mask(folder, name, _mask_of(new, index)) if masked else None,
                 camera=new.cameras[index],
                 camera_model=_MODEL,
-                extra={"generated": True, **origin},
+                extra=origin.record(),
             )
         )
     return frames

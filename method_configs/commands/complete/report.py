@@ -31,7 +31,7 @@ _MOST_NAMED = 5  # photos that are left out, on the screen
 _METHODS = {"known": "given", "model": "by the model", "features": "by features"}
 
 
-def announcement(
+def announcement_of_work(
     photos: list[Photo],
     options: CompleteOptions,
     model: Fillerbuster | None,

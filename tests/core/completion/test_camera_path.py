@@ -14,7 +14,7 @@ from helpers.scenes.completions import MeanFiller, box_points, captured, room_ca
 from nerfstudio.cameras.camera_paths import get_path_from_json
 
 from fb_core.completion.planning.plan import plan_completion
-from fb_core.completion.rounds import announcement, run_completion
+from fb_core.completion.rounds import announcement_of_rounds, run_completion
 from fb_core.data.capture.camera_path import as_camera_path, read_camera_path
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.bridge import to_pinholes
@@ -59,7 +59,7 @@ def test_a_path_is_generated_where_it_is_even_outside_the_walls(tmp_path: Path):
     assert sorted(map(str, got.tolist())) == sorted(map(str, wanted.tolist()))
     assert [(one.role, len(one.cameras)) for one in plan.rounds] == [("anchor", 3), ("densify", 2), ("densify", 2)]
     assert torch.equal(plan.rounds[0].cameras.camera_to_world, wanted[[0, 3, 6]])
-    assert "7 new views along path.json" in announcement(plan, config, MeanFiller())
+    assert "7 new views along path.json" in announcement_of_rounds(plan, config, MeanFiller())
 
 
 def test_a_long_path_is_thinned_evenly(tmp_path: Path):

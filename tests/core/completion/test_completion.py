@@ -13,7 +13,7 @@ from helpers.scenes.completions import UP, MeanFiller, box_points, captured, roo
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import plan_completion
 from fb_core.completion.results.completed_views import CompletedViews
-from fb_core.completion.rounds import CapturedView, announcement, fitted_view, run_completion
+from fb_core.completion.rounds import CapturedView, announcement_of_rounds, fitted_view, run_completion
 from fb_core.data.capture.captures import validate_capture
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.raymap import raymaps_of
@@ -68,7 +68,7 @@ def test_captures_of_one_two_and_three_views(count: int):
     config = small(context_views=16)
     plan = plan_completion(room_cameras()[:count], None, config, size=16)
     assert sorted(plan.context) == list(range(count))
-    text = announcement(plan, config, MeanFiller())
+    text = announcement_of_rounds(plan, config, MeanFiller())
     assert "asked for 16" in text and f"{count} of {count} captured" in text and "01234567" in text
 
 
@@ -257,7 +257,7 @@ def test_the_announcement_tells_model_views_passes_seconds_and_memory():
             return 50.0 * len(asked), views * 2**28
 
     context = len(plan.context)
-    text = announcement(plan, config, Telling())
+    text = announcement_of_rounds(plan, config, Telling())
     assert asked == [(context + 4, context), (context + 4 + 3, context + 4), (context + 4 + 3, context + 4)]
     gib = max(views for views, _ in asked) / 4
     assert (
@@ -266,9 +266,9 @@ def test_the_announcement_tells_model_views_passes_seconds_and_memory():
     )
     asked.clear()
     views = next(run_completion(plan, [captured(room_cameras())[i] for i in plan.context], MeanFiller(), config))
-    announcement(plan, config, Telling(), done=views)
+    announcement_of_rounds(plan, config, Telling(), done=views)
     assert len(asked) == 2, "the anchors are there already"
-    assert "about" not in announcement(plan, config, MeanFiller())
+    assert "about" not in announcement_of_rounds(plan, config, MeanFiller())
 
 
 def test_the_lazy_model_tells_without_its_weights(tmp_path: Path):

@@ -12,7 +12,7 @@ from helpers.scenes.completions import MeanFiller, box_points, room_cameras
 from helpers.scenes.coverages import AUTO, UP, turning
 
 from fb_core.completion.planning.plan import plan_completion
-from fb_core.completion.rounds import announcement
+from fb_core.completion.rounds import announcement_of_rounds
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.free_space import FreeSpace
 
@@ -80,13 +80,15 @@ def test_where_nobody_can_tell_new_cameras_stay_at_captured_places_and_a_sentenc
         )
         < 1e-5
     )
-    assert plan.blind and announcement(plan, AUTO, MeanFiller()).startswith("Nobody can tell yet where surfaces are")
+    assert plan.blind and announcement_of_rounds(plan, AUTO, MeanFiller()).startswith(
+        "Nobody can tell yet where surfaces are"
+    )
     free = FreeSpace(cameras=tuple(cameras), depth=(torch.full((16, 16), 2.0),) * 6)
     for told in (
         plan_completion(cameras, box_points().double(), AUTO, size=16),
         plan_completion(cameras, None, AUTO, size=16, free=free),
     ):
-        assert not told.blind and "Nobody can tell" not in announcement(told, AUTO, MeanFiller())
+        assert not told.blind and "Nobody can tell" not in announcement_of_rounds(told, AUTO, MeanFiller())
 
 
 def test_an_allowed_collision_is_no_reason_to_stay() -> None:

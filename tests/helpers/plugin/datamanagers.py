@@ -103,9 +103,9 @@ def stand_in_model(monkeypatch):
 
 
 def options(**changes) -> CompletionConfig:
-    return CompletionConfig(
-        **{"context_views": 3, "anchor_views": 4, "densify_rounds": 1, "densify_views": 2, "steps": 2, **changes}
-    )
+    """A small completion from the first step on, whose views are believed and take half of the steps."""
+    sizes = {"context_views": 3, "anchor_views": 4, "densify_rounds": 1, "densify_views": 2, "steps": 2}
+    return CompletionConfig(**{**sizes, "at_step": 0, "generated_share": 0.5, "trust": "full", **changes})
 
 
 def make(

@@ -11,11 +11,11 @@ import pytest
 import torch
 from helpers.folders.runs import make_run
 from helpers.plugin.datamanagers import GreyFiller, attributes, draws, run_callbacks
+from helpers.plugin.datamanagers import options as small_completion
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from fb_core.completion.brought_views import brought_views
-from fb_core.completion.options import CompletionConfig
 from fb_core.completion.requests import RemoveView, key_of
 from fb_core.completion.results.completed_views import BROUGHT, round_title
 from fb_core.data.capture.captures import FrameToWrite, read_capture, split_lists, write_capture, write_transforms
@@ -103,11 +103,10 @@ def capture(tmp_path: Path) -> Path:
 
 
 def make(data: Path, **options: Any) -> FillerbusterDataManager:
-    small = {"context_views": 3, "anchor_views": 4, "densify_rounds": 1, "densify_views": 2, "steps": 2, **options}
     config = FillerbusterDataManagerConfig(
         data=data,
         dataparser=NerfstudioDataParserConfig(),
-        completion=CompletionConfig(**small),
+        completion=small_completion(**options),
         cache_images_type="uint8",
         start_points=0,
     )
@@ -294,7 +293,7 @@ def test_small_generated_views_are_no_reason_to_refuse_small_photos(capture: Pat
     config = FillerbusterDataManagerConfig(
         data=capture,
         dataparser=NerfstudioDataParserConfig(),
-        completion=CompletionConfig(steps=2),
+        completion=small_completion(),
         start_points=0,
         camera_res_scale_factor=0.7,
     )

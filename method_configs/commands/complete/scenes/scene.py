@@ -47,7 +47,6 @@ from method_configs.commands.complete.scenes.scene_budget import SceneBudget, Sp
 from method_configs.commands.complete.scenes.scene_training import train_scene
 
 _FEATURES_SIDE = 960  # of photos in which features are sought for the first Gaussians
-_GENERATED_SHARE = 0.3  # as ns-train fillerbuster
 _BYTES, _BYTES_TRAINED = 4, 500  # for each pixel of the photos, and of the picture that is trained on
 _LARGE = 1000.0  # spreads off the origin from which single precision moves Gaussians: the file's world is then shifted
 _logger = logging.getLogger(__name__)
@@ -143,7 +142,7 @@ def complete_with_splats(job: SceneJob, *, seconds: float, on_progress: OnProgre
     Raises ValueError in one sentence for what cannot be trained on.
     """
     budget = _budget(job, seconds)
-    _logger.info(announcement(job, budget))
+    _logger.info(announcement_of_scene(job, budget))
     capture = _capture_to_train(job, budget.photo_side)
     budget = dataclasses.replace(
         budget, schedule=dataclasses.replace(budget.schedule, scale=_scale_of(capture, budget.photo_side))
@@ -177,7 +176,7 @@ def complete_with_splats(job: SceneJob, *, seconds: float, on_progress: OnProgre
     return _new_views(generated, film), told
 
 
-def announcement(job: SceneJob, budget: SceneBudget) -> str:
+def announcement_of_scene(job: SceneJob, budget: SceneBudget) -> str:
     """One sentence on what is about to be done and how long it may take."""
     size = job.path(budget.film_side)
     along = (
@@ -297,8 +296,6 @@ def completion_of(job: SceneJob, budget: SceneBudget) -> CompletionConfig:
         steps=options.steps,
         precision=options.precision,
         seed=options.seed,
-        generated_share=_GENERATED_SHARE,
-        trust="measured",
         film_path=path,
     )
 
@@ -363,12 +360,12 @@ def _new_views(generated: CompletedViews | None, film: FilmFiles) -> NewViews:
     if generated is not None:
         generated = generated[[index for index, mask in enumerate(generated.masks) if bool(mask.any())]]
     if generated is None or not len(generated):
-        return NewViews(images=torch.zeros(0, 3, 1, 1), cameras=film.cameras[[]].scaled(1, 1), origins=[], film=film)
+        return NewViews(images=torch.zeros(0, 3, 1, 1), cameras=film.cameras[[]].scaled(1, 1), origins=(), film=film)
     return NewViews(
         images=generated.images.movedim(-1, 1).float() / 255,
         masks=generated.masks.movedim(-1, 1).float(),
         cameras=generated.cameras,
-        origins=[dataclasses.asdict(origin) for origin in generated.origins],
+        origins=generated.origins,
         film=film,
     )
 

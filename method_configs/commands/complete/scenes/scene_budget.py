@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from fb_core.completion.options import CompletionConfig
 from fb_core.geometry.cameras import Pinholes
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.scene_film import film_frame
@@ -15,7 +16,6 @@ from fb_nerfstudio.splats.splat_file import Splats
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.scenes.scene_training import SceneSchedule
 
-_COMPLETE_AT = 500  # as ns-train fillerbuster
 FEWEST_STEPS, MOST_STEPS = 300, 7000
 _WANTED_STEPS = 1500  # enough for what photos show; more time goes into larger pictures first
 _SIDES = (64, 96, 128, 160, 240, 320, 480, 640, 960, 1280, 1920, 2560, 3840)  # of pictures that splats are trained on
@@ -96,10 +96,11 @@ class SceneBudget:
         )
         film_side = min(film_side, longest)
         most = _ON_GPU if torch.device(device).type == "cuda" else _ON_CPU
+        complete_at = min(CompletionConfig.at_step, max(1, steps // 2))
         return SceneBudget(
             photo_side=side,
             film_side=film_side,
-            schedule=SceneSchedule(steps=steps, complete_at=min(_COMPLETE_AT, max(1, steps // 2)), most_gaussians=most),
+            schedule=SceneSchedule(steps=steps, complete_at=complete_at, most_gaussians=most),
             seconds=training(side, steps) + film(film_side),
         )
 

@@ -36,7 +36,7 @@ def test_metrics_treat_every_view_alone():
 
 
 def test_ssim_agrees_with_the_loss_of_the_splats():
-    """Two implementations, one of them for losses; both use valid windows only."""
+    """One implementation, for pictures in either layout; both use valid windows only."""
     from fb_core.splatting import photometric
 
     images, truth = pictures(), (pictures() + 0.1 * torch.randn(3, 3, 24, 24)).clamp(0, 1)
@@ -44,6 +44,26 @@ def test_ssim_agrees_with_the_loss_of_the_splats():
         [photometric.ssim(a.movedim(0, -1), b.movedim(0, -1)) for a, b in zip(images, truth, strict=True)]
     )
     assert torch.allclose(ssim(images, truth), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("scene", ["noise", "near", "one colour", "black"])
+def test_ssim_agrees_with_two_libraries(scene: str):
+    """kornia's without what it adds to denominators, torchmetrics' without windows that hang over the border."""
+    from kornia.metrics import ssim as of_kornia
+    from torchmetrics.functional.image import structural_similarity_index_measure as of_torchmetrics
+
+    truth = pictures(side=32).double()
+    images = truth.flip(3)
+    if scene == "near":
+        images = (truth + 0.02 * torch.randn(3, 3, 32, 32)).clamp(0, 1)
+    elif scene != "noise":
+        truth = torch.full_like(truth, 0.5 if scene == "one colour" else 0.0)
+        images = truth + 1e-3
+    ours = ssim(images, truth)
+    kornia = of_kornia(images, truth, 11, 1.0, eps=0.0, padding="valid").mean(dim=(1, 2, 3))
+    assert torch.allclose(ours, kornia, atol=1e-6)
+    _, whole = of_torchmetrics(images, truth, data_range=1.0, reduction="none", return_full_image=True)
+    assert torch.allclose(ours, whole[..., 5:-5, 5:-5].mean(dim=(1, 2, 3)), atol=1e-6)
 
 
 def test_ssim_of_constant_pictures_is_its_luminance_term():

@@ -16,7 +16,7 @@ from helpers.scenes.coverages import AUTO, UP, turning
 from fb_core.completion.options import CompletionConfig, PlacementConfig
 from fb_core.completion.planning.candidate_views import Candidates
 from fb_core.completion.planning.plan import plan_completion
-from fb_core.completion.rounds import announcement
+from fb_core.completion.rounds import announcement_of_rounds
 from fb_core.data.rooms.room import FAMILIES, make_room
 from fb_core.data.rooms.room_cameras import free_positions, training_cameras
 from fb_core.geometry.cameras import Pinholes
@@ -115,7 +115,7 @@ def test_a_capture_that_lacks_nothing_gets_no_view_and_one_sentence() -> None:
     plan = plan_completion(everywhere(), box_points().double(), AUTO, size=16)
     assert plan.rounds == () and plan.covered is not None and plan.covered[0] > 0.98
     assert (
-        announcement(plan, AUTO, MeanFiller())
+        announcement_of_rounds(plan, AUTO, MeanFiller())
         == f"The capture shows {plan.covered[0]:.0%} of what surrounds it, so no view is generated."
     )
 
