@@ -590,3 +590,15 @@ def test_real_photos(shared_path, tmp_path: Path) -> None:
     photos = read_photos(tmp_path)
     assert [photo.size for photo in photos] == [(1920, 1080)] * 3 and doubtful(photos) == {}
     assert photos[0].load(128).shape == (3, 128, 72)
+
+
+@pytest.mark.parametrize(("folder", "told"), [("masks", True), ("Mask", True), ("sorted out", False)])
+def test_a_folder_of_masks_beside_photos_is_not_used_without_a_word(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, folder: str, told: bool
+) -> None:
+    for name in ("Foto ä 1.png", "Foto ä 2.png"):
+        save(tmp_path / name, scene(len(name)))
+    (tmp_path / folder).mkdir()
+    with caplog.at_level(logging.WARNING):
+        photos = read_photos(tmp_path)
+    assert len(photos) == 2 and any("is not used" in line for line in caplog.messages) == told
