@@ -31,6 +31,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".exr", ".b
 THUMBNAIL_SIDE = 96
 FILM_FRAMES = 32
 """How many frames of a film are read when the caller does not say."""
+_MASKS = {"mask", "masks", "mask_images", "alpha"}  # folders beside photos, as tools name them
 _logger = logging.getLogger(__name__)
 
 
@@ -78,6 +79,12 @@ def _of_folder(folder: Path) -> list[Photo]:
     photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
     if not photos:
         raise ValueError(f"photos {folder}: expected at least 2 photos in the folder, got {_what_else(folder, files)}")
+    if masks := [path.name for path in sorted(folder.iterdir()) if path.is_dir() and path.name.lower() in _MASKS]:
+        _logger.warning(
+            "%s: the folder %s is not used; give photos their masks as alpha channels, or a capture with mask_path",
+            folder,
+            masks[0],
+        )
     names = _unique_names([path.stem for path in photos])
     return _readable(folder, [(path, partial(_still, path, name)) for path, name in zip(photos, names, strict=True)])
 

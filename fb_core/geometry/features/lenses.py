@@ -134,21 +134,23 @@ class LensGuess:
         return dataclasses.replace(self, lens=lens, focal=focal, bend=bend, **values)
 
     def notes(self, sides: Sequence[int]) -> list[str]:
-        """What is worth telling of the lenses, given the photos' longer sides in pixels: tags that lie, several lenses,
-        bent ones.
+        """What is worth telling of the lenses, given the photos' longer sides in pixels: tags that lie, several lenses
+        (a photo that was made smaller has no other one), bent ones.
         """
-        notes, side = [], max(sides)
+        notes = list[str]()
+        side = np.array([max(np.array(sides)[self.lens == lens], default=1) for lens in range(len(self.focal))])
         lies = np.flatnonzero(self.tagged & ~self.believed & (np.abs(np.log(self.focal / self.told)) > ONE_LENS / 2))
         if len(lies):
             worst = lies[int(np.argmax(np.abs(np.log(self.focal[lies] / self.told[lies]))))]
-            off = f"{self.told[worst] / side:.2f} longer sides told, {self.focal[worst] / side:.2f} found"
+            off = f"{self.told[worst] / side[worst]:.2f} longer sides told, {self.focal[worst] / side[worst]:.2f} found"
             notes.append(
                 f"The focal length that {int(np.isin(self.lens, lies).sum())} photos tell contradicts their features "
                 f"({off})."
             )
-        own = self.focal[~self.fixed]
+        own = np.sort((self.focal / side)[~self.fixed])
+        own = own[np.append(True, np.diff(np.log(own)) > SAME_LENS[-1])[: len(own)]]
         if len(own) > 1 and not (self.believed & ~self.fixed).any():
-            lengths = ", ".join(f"{value / side:.2f}" for value in sorted(own))
+            lengths = ", ".join(f"{value:.2f}" for value in own)
             notes.append(f"The photos were taken with {len(own)} focal lengths ({lengths} longer sides).")
         if self.bends:
             k1, k2 = self.bend[int(np.argmax(np.abs(self.bend).max(axis=1)))]

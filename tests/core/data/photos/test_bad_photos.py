@@ -99,3 +99,15 @@ def test_a_photo_that_vanishes_is_named_when_it_is_loaded(tmp_path: Path) -> Non
     (tmp_path / "1.png").unlink()
     with pytest.raises(ValueError, match=r"1\.png: no such file"):
         photos[1].load()
+
+
+@pytest.mark.parametrize(("folder", "told"), [("masks", True), ("Mask", True), ("sorted out", False)])
+def test_a_folder_of_masks_beside_photos_is_not_used_without_a_word(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, folder: str, told: bool
+) -> None:
+    for name in ("Foto ä 1.png", "Foto ä 2.png"):
+        save(tmp_path / name, scene(len(name)))
+    (tmp_path / folder).mkdir()
+    with caplog.at_level(logging.WARNING):
+        photos = read_photos(tmp_path)
+    assert len(photos) == 2 and any("is not used" in line for line in caplog.messages) == told

@@ -219,6 +219,19 @@ def test_a_focal_length_that_is_told_wrongly_is_not_believed(lie: float):
     assert any("contradicts" in note for note in found.notes)
 
 
+def test_photos_that_were_made_smaller_have_no_other_lens():
+    """A smaller copy has another focal length in pixels, and the same one in longer sides."""
+    truth, small = around(6, arc_degrees=60.0, focal=450.0), 2 / 3
+    photos = photos_of(truth, cloud(160))
+    for index in (1, 4):
+        places, (height, width) = photos[index].places * small, photos[index].size
+        size = (round(height * small), round(width * small))
+        photos[index] = dataclasses.replace(photos[index], places=places, size=size, lens="a smaller size")
+    found = chain(photos)
+    assert all(found.trusted) and not found.notes, (found.reasons, found.notes)
+    assert focal_lengths(found) == pytest.approx([450.0, 300.0, 450.0, 450.0, 300.0, 450.0], rel=0.01)
+
+
 def test_known_cameras_keep_their_lens():
     truth = around(3, arc_degrees=30.0)
     photos = [dataclasses.replace(photo, known=True) for photo in photos_of(truth, cloud(120), told=505.0)]
