@@ -75,7 +75,7 @@ def carried_over(
     count, (height, width) = len(wanted), wanted.shape[-2:]
     if not len(images) or not count:
         return Carried(wanted.new_zeros(count, 3, height, width), wanted.new_zeros(count, 1, height, width))
-    lens = _lens_of(raymaps)
+    lens = _lens_of_rays(raymaps)
     directions = rearrange(wanted[:, 3:], "m c h w -> 1 m h w c")
     origins = raymaps[:, :3].flatten(2).mean(dim=2)
     if distance is not None:
@@ -110,7 +110,7 @@ def _sampled(
     return rearrange(taken, "k c (m h) w -> k m c h w", m=place.shape[1])
 
 
-def _lens_of(raymaps: Float[Tensor, "k 6 h w"]) -> _Lens:
+def _lens_of_rays(raymaps: Float[Tensor, "k 6 h w"]) -> _Lens:
     """Axes, focal lengths and principal points from the rays' directions."""
     height, width = raymaps.shape[-2:]
     axes = torch.stack([axes_of(directions) for directions in raymaps[:, 3:]])

@@ -168,7 +168,7 @@ def combined(
         image, rays = split(prompted - conditional)
         velocity = velocity + text_scale * unsplit(image, torch.zeros_like(rays))
     if variant.rescale > 0 and velocity is not conditional:
-        velocity = velocity * (1 + variant.rescale * (_spread(conditional) / _spread(velocity) - 1))
+        velocity = velocity * (1 + variant.rescale * (_deviation(conditional) / _deviation(velocity) - 1))
     return velocity
 
 
@@ -185,7 +185,7 @@ def _fitted(null: Tensor, conditional: Tensor) -> Tensor:
     return unsplit(*map(of, zip(split(null), split(conditional), strict=True)))
 
 
-def _spread(velocity: Tensor) -> Tensor:
+def _deviation(velocity: Tensor) -> Tensor:
     """Standard deviation per view and modality, never 0 (also not in its gradient)."""
 
     def of(part: Tensor) -> Tensor:

@@ -100,7 +100,7 @@ class NerfstudioWithoutOpen3d(Nerfstudio):
         chosen = self._chosen(capture, frames, photos, split)
         files = [self._file(frames[place].image_path, capture, "images_") for place in chosen]
         wide = {
-            str(path): _lens_of(frames[place])
+            str(path): _lens_of_frame(frames[place])
             for place, path in zip(chosen, files, strict=True)
             if _is_wide(frames[place])
         }
@@ -331,7 +331,7 @@ def _is_wide(frame: Frame) -> bool:
     return is_too_wide(frame.camera, frame.camera_model, frame.distortion)
 
 
-def _lens_of(frame: Frame) -> Lens:
+def _lens_of_frame(frame: Frame) -> Lens:
     return frame.camera, frame.camera_model, frame.distortion
 
 

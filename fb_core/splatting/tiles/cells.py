@@ -177,7 +177,7 @@ def slabs(strips: Strips, budget: int) -> list[tuple[int, int]]:
     return runs
 
 
-def _spread(counts: Int32[Tensor, " k"]) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " k"], int]:
+def _repeated(counts: Int32[Tensor, " k"]) -> tuple[Int32[Tensor, " m"], Int32[Tensor, " k"], int]:
     """Repeat index k counts[k] times: (the indices, the position where each begins, their number)."""
     ends = counts.cumsum(0, dtype=torch.int32)
     number = int(ends[-1]) if ends.numel() else 0
@@ -190,7 +190,7 @@ def list_cells(
 ) -> CellLists:
     """The lists of one run of Gaussians; cells that are no longer `alive` (opaque already) get empty lists."""
     (begin, end), grid = run, ellipses.grid
-    owner, first, number = _spread(strips.rows[begin:end])
+    owner, first, number = _repeated(strips.rows[begin:end])
     owner = owner.int() + begin if begin else owner.int()
 
     def of(column: Tensor) -> Tensor:
@@ -226,7 +226,7 @@ def _sorted_lists(owner: Tensor, base: Tensor, widths: Tensor, grid: CellGrid, a
     """Expand strips (first cell, number of cells, Gaussian) to rows and sort these by cell; the sort keeps the depth
     order.
     """
-    strip, first, number = _spread(widths)
+    strip, first, number = _repeated(widths)
     strip = strip.int()
     cell = (base - first).index_select(0, strip).add_(torch.arange(number, dtype=torch.int32, device=base.device))
     splat = owner.index_select(0, strip)
