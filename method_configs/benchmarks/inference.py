@@ -199,7 +199,8 @@ def draw(report: Report, path: Path) -> None:
     """Seconds over the number of views, a curve for each size and number of steps, and the paper's beside them."""
     from method_configs.benchmarks.figures import new_axes, save_figure
 
-    figure, axes = new_axes("seconds")
+    processor = any(row["clock"] == "processor" for row in report.rows)
+    figure, axes = new_axes("seconds on a processor" if processor else "seconds")
     for size, steps in dict.fromkeys((row["size"], row["steps"]) for row in report.rows):
         rows = [row for row in report.rows if (row["size"], row["steps"]) == (size, steps)]
         label = f"{size} pixels, {steps} steps, {rows[0]['how']}"
@@ -209,5 +210,5 @@ def draw(report: Report, path: Path) -> None:
             axes.plot(*zip(*paper, strict=True), "x--", label=f"paper: A100, {size} pixels, {steps} steps, its model")
     axes.set_yscale("log")
     axes.set_xlabel("views")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     save_figure(figure, path)

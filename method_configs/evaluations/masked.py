@@ -188,7 +188,7 @@ def require_masks(data: Path) -> None:
 
 
 def masked_row(run: Path, files: Masked | Paper) -> dict[str, Any]:
-    """One run, as a row of table 1."""
+    """One run, as a row of table 1. Raises ValueError for a run whose method inpaints nothing."""
     from fb_nerfstudio.runs.finished_run import capture_of, identity_of, read_run
 
     config, state = read_run(run)
