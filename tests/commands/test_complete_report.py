@@ -23,7 +23,7 @@ from fb_core.registration.choice import Registration
 from method_configs.commands.complete.forecast import Forecast, forecast
 from method_configs.commands.complete.options import CompleteOptions
 from method_configs.commands.complete.output import _write_photo
-from method_configs.commands.complete.report import no_cameras, what_was_found
+from method_configs.commands.complete.report import announcement, no_cameras, what_was_found
 
 PHOTOS = [photo_of(torch.zeros(3, 24, 32), name=f"photo {index}", device="one") for index in range(3)]
 
@@ -139,3 +139,14 @@ def test_the_straight_picture_is_what_is_written(tmp_path: Path):
     (tmp_path / "out").mkdir()
     written = media.read_image(_write_photo(straight, tmp_path / "out", as_it_is=straight.stored))
     assert float((written - straight.load()).abs().max()) < 0.01
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_memory_counts_the_process_and_its_photos(count: int):
+    """Libraries and drawing take more than the bundled model does."""
+    photos = [photo_of(torch.zeros(3, 24, 32), name=f"photo {index}", device="one") for index in range(count)]
+    told = forecast(photos, CompleteOptions(cameras="features", poses_only=True), None, None, None)
+    assert 1.0 < told.memory / 2**30 < 2.0  # seen: 1.03 to 1.46 GiB
+    assert "GiB of memory" in announcement(
+        photos, CompleteOptions(cameras="features", poses_only=True), None, None, None, told
+    )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,8 @@ def draw_cameras(
     """
     if not cameras:
         raise ValueError("camera figure: expected at least one camera, got none")
+    with suppress(ImportError):  # loaded after VTK has drawn by Mesa, its LLVM ends the process (triton 3.9, VTK 9)
+        import triton  # noqa: F401
     import pyvista
     import vtk
 

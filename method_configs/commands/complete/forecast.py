@@ -11,6 +11,7 @@ from fb_core.completion.duration import SquareSequence, expected_seconds, second
 from fb_core.data.photos.photo import Photo
 from fb_core.geometry.features.pairs import FEATURES, pairs_at_most
 from fb_core.inpainter import Fillerbuster, SamplingConfig
+from fb_core.memory.budget import GIB
 from fb_core.registration.by_features import LONGEST_SIDE
 from method_configs.commands.complete.options import CHECKED, POSES_AT_ONCE, CompleteOptions
 from method_configs.commands.complete.plan import Plan
@@ -23,6 +24,7 @@ _PER_PIXEL = 1 / 20  # features per pixel, at most
 _MATCH = 1000  # two features of two photos
 _BUILD, _CROWD = 6.3e9, 24  # a photo and each of the others, up to so many, that cameras are found together with
 _DRAW, _SHOWN = 400e9, 12e9  # the sheet and the cameras' picture; each picture in them
+_PROCESS, _BYTES = int(1.3 * GIB), 4  # with all libraries loaded; of a pixel of every photo
 _SLOWEST, _FASTEST = 8.0, 1 / 8  # by which the rest is corrected at most
 
 
@@ -31,6 +33,8 @@ class Forecast:
     """Seconds of stages by their names, in order."""
 
     stages: Mapping[str, float]
+    memory: int = 0
+    """Bytes that the process takes beside the model."""
 
     @property
     def total(self) -> float:
@@ -74,7 +78,13 @@ def forecast(
                 stages["self-consistency"] = _seconds_of_features(sides, [_pixels(photo) for photo in photos[:checked]])
     views = 0 if plan is None else sum(map(len, plan.passes.views))
     written = 4 * _READ * sum(map(_pixels, photos)) + _DRAW + _SHOWN * (len(photos) + views)
-    return Forecast(stages=stages | {"writing": seconds_of_products(written)})
+    beside = memory_beside(photos) if model is None or model.device.type == "cpu" else 0  # on a GPU, it is the GPU's
+    return Forecast(stages=stages | {"writing": seconds_of_products(written)}, memory=beside)
+
+
+def memory_beside(photos: Sequence[Photo]) -> int:
+    """Bytes that the process takes beside the model and what is trained: libraries, drawing, photos at full size."""
+    return _PROCESS + int(_BYTES * 1e6 * sum(map(_pixels, photos)))
 
 
 def _pixels(photo: Photo) -> float:

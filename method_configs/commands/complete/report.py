@@ -42,18 +42,18 @@ def announcement_of_work(
     """One sentence on what is about to be done, how long it may take and how much memory it needs."""
     unknown = sum(photo.camera is None for photo in photos)
     posed = "" if unknown == len(photos) else f" ({len(photos) - unknown} with known cameras)"
-    seconds, memory = forecast.total, 0
+    seconds, memory = forecast.total, forecast.memory
     if model is None or (plan is None and unknown == 0):
         how = "known" if unknown == 0 else "features"
-        return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {in_words(seconds)}."
+        return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {in_words(seconds, memory)}."
     if unknown and options.cameras != "features":
         assert pose_sampling is not None
-        memory = _memory(model, min(len(photos), POSES_AT_ONCE), model.size, pose_sampling)
+        memory += _memory(model, min(len(photos), POSES_AT_ONCE), model.size, pose_sampling)
     name = "the bundled model" if options.model is None else f"model {options.model.name}"
     named = f"{name} ({model.model_hash[:8]})"
     if plan is None:
         return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {in_words(seconds, memory)}."
-    memory = max(memory, _memory(model, plan.longest, plan.side, plan.sampling, options.prompt))
+    memory = max(memory, forecast.memory + _memory(model, plan.longest, plan.side, plan.sampling, options.prompt))
     count = len(plan.passes.views)
     passes = (
         f"{count} {'pass' if count == 1 else 'passes'} of {plan.sampling.steps} steps over up to {plan.longest} views"

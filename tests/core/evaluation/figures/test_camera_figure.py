@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,22 @@ def test_any_world_any_sizes_one_place_and_one_camera_can_be_drawn(tmp_path: Pat
 def test_nothing_to_draw_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="expected at least one camera, got none"):
         draw_cameras(tmp_path / "a.png", [], [])
+
+
+def test_what_is_imported_after_a_drawing_does_not_end_the_process(tmp_path: Path):
+    """torch's counter of operations imports triton, whose LLVM and Mesa's are in one another's way: a segmentation
+    fault in the second `complete` of a process.
+    """
+    program = (
+        "import sys, torch\nfrom pathlib import Path\n"
+        "from fb_core.evaluation.figures.camera_figure import draw_cameras\n"
+        "from fb_core.geometry.cameras import Pinholes\n"
+        "one = Pinholes(camera_to_world=torch.eye(4)[None, :3], focal=torch.full((1, 2), 8.0), "
+        "principal=torch.full((1, 2), 4.0), width=8, height=8)\n"
+        "draw_cameras(Path(sys.argv[1]), [one], [torch.zeros(3, 8, 8)])\n"
+        "import torch.utils.flop_counter\nprint('went on')"
+    )
+    child = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "cameras.png")], capture_output=True, text=True, check=False
+    )
+    assert child.returncode == 0 and child.stdout.strip() == "went on", child
