@@ -11,6 +11,7 @@ _LEFT_BY_TRAINING = {
     "dataparser_transforms.json",
     "nerfstudio_models",
     "completion",
+    "completion.json",
     "viewer_log_filename.txt",
 }
 _EVENTS = "events.out.tfevents."

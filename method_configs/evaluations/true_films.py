@@ -8,6 +8,7 @@ same room, along the same path, carries paint.
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ _CELLS = 96  # after which the noise repeats
 _MOST_TURN = 25.0  # degrees between two photos of a pair, about what a film turns by in a second
 _BLUR = 1 / 27  # standard deviation of the blur over the longer side of a frame
 _DISAGREE = 10.0  # degrees that each frame is turned by, another way in every frame
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,8 @@ def true_films(
         seed: draws pairs of photos and what is spoilt.
         controls: also the same spoilt; of a room, painted before.
 
-    Raises ValueError for a capture in which no two photos look about the same way.
+    Returns:
+        Nothing, which the log says, for photos of which no two look about the same way.
     """
     exact = true_pictures(capture, pipeline, captured, film.cameras)
     if exact is not None:
@@ -69,14 +72,16 @@ def true_films(
         return view.image * view.known
 
     photos = Film(pictures=photo, cameras=captured, pairs=photo_pairs(captured, len(film.pairs), seed))
+    if not photos.pairs:
+        _logger.warning(
+            "%s: no two photos look the same way within %g degrees, so none are judged", capture, _MOST_TURN
+        )
+        return {}
     return {PHOTOS: photos} | (spoilt(PHOTOS, photos, seed) if controls else {})
 
 
 def photo_pairs(cameras: Sequence[Pinholes], count: int, seed: int) -> list[tuple[int, int]]:
-    """So many pairs, or as many as there are, of cameras that are turned by at most 25 degrees; sorted.
-
-    Raises ValueError if there is none.
-    """
+    """So many pairs, or as many as there are, of cameras that are turned by at most 25 degrees; sorted."""
     import numpy as np
     import torch
 
@@ -88,11 +93,6 @@ def photo_pairs(cameras: Sequence[Pinholes], count: int, seed: int) -> list[tupl
         for second in range(first + 1, len(cameras))
         if rotation_angle_degrees(true_rotation(cameras[first], cameras[second]), np.eye(3)) <= _MOST_TURN
     ]
-    if not every:
-        raise ValueError(
-            f"photos: no two of {len(cameras)} look the same way within {_MOST_TURN:g} degrees, so there is no true "
-            "pair to judge; leave it out with --no-true-film"
-        )
     chosen = torch.randperm(len(every), generator=torch.Generator().manual_seed(seed))[:count]
     return sorted(every[index] for index in chosen.tolist())
 

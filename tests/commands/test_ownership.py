@@ -21,7 +21,7 @@ from fb_core.completion.results.completed_views import CompletedViews, views_tar
 from fb_core.data.capture.captures import read_capture
 from fb_core.files.ownership import MARK_NAME, Target, foreign_files, kind_of
 from fb_core.files.whole import whole_folder
-from fb_nerfstudio.generation.generation import Generation
+from fb_nerfstudio.generation.generation import REPORT_NAME, Generation
 from fb_nerfstudio.runs.earlier_runs import clear_run
 from method_configs.commands import command_line as commands
 from method_configs.commands import demo
@@ -253,8 +253,10 @@ def test_a_demo_follows_no_link_and_spares_its_model(tmp_path: Path):
 
 def test_an_earlier_run_is_taken_away_whole(tmp_path: Path):
     run = tmp_path / "runs" / "run"
-    (run / "nerfstudio_models").mkdir(parents=True)
-    (run / "config.yml").touch()
+    for folder in ("nerfstudio_models", "completion"):
+        (run / folder).mkdir(parents=True)
+    for name in ("config.yml", "dataparser_transforms.json", REPORT_NAME, "events.out.tfevents.1.vm.2.0"):
+        (run / name).touch()
     clear_run(run, tmp_path)
     clear_run(run, tmp_path)  # and nothing happens where none is
     assert list((tmp_path / "runs").iterdir()) == []

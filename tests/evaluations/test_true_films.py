@@ -98,8 +98,16 @@ def test_pairs_of_photos_look_about_the_same_way():
     ring = Pinholes.looking_at(torch.zeros(4, 3), targets, up=textured_box.UP, fov_degrees=60.0, width=16, height=16)
     cameras = [ring[index] for index in range(4)]
     assert photo_pairs(cameras, 20, 0) == [(0, 1), (1, 2)] and len(photo_pairs(cameras, 1, 0)) == 1
-    with pytest.raises(ValueError, match=r"no two of 2 look the same way within 25 degrees.*--no-true-film"):
-        photo_pairs([cameras[0], cameras[3]], 20, 0)
+    assert photo_pairs([cameras[0], cameras[3]], 20, 0) == []
+
+
+def test_photos_that_look_into_all_directions_are_left_out(tiny_capture: Path, caplog: pytest.LogCaptureFixture):
+    targets = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
+    both = Pinholes.looking_at(torch.zeros(2, 3), targets, up=textured_box.UP, fov_degrees=60.0, width=16, height=16)
+    pipeline, _ = photos_of_a_box()
+    asked = Film(pictures=lambda _: torch.zeros(3, 8, 8), cameras=both, pairs=[(0, 1)])
+    assert true_films(tiny_capture, pipeline, [both[0], both[1]], asked, seed=0, controls=True) == {}
+    assert "no two photos look the same way within 25 degrees, so none are judged" in caplog.text
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
