@@ -7,6 +7,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import torch
@@ -55,13 +56,13 @@ class LiveBytes:
 
     def _remember(self, storage: torch.UntypedStorage, size: int) -> None:
         key = storage._cdata
-
-        def freed(_: weakref.ref) -> None:
-            self._sizes.pop(key, None)
-            self.now -= size
-
-        self._sizes[key] = weakref.ref(storage, freed), size
+        # No function of its own for each storage: the tests' shape checks would check and compile every one of them.
+        self._sizes[key] = weakref.ref(storage, partial(self._freed, key, size)), size
         self.now += size
+
+    def _freed(self, key: int, size: int, _: weakref.ref) -> None:
+        self._sizes.pop(key, None)
+        self.now -= size
 
 
 class _Counting(TorchDispatchMode):

@@ -193,7 +193,7 @@ def _model_and_optimizers(
     ]
     points = torch.cat([capture.points.positions, places[chosen]])
     bytes_ = (torch.cat([capture.points.colors, colors[chosen]]) * 255).round()
-    some = evenly_chosen(len(points), config.max_gaussians // 2)  # room to grow
+    some = evenly_chosen(len(points), config.max_gaussians // 2)  # half the cap, so that there is room for more
     settings = dataclasses.replace(
         fillerbuster.config.pipeline.model,
         strategy="default" if strategy == "default" else "mcmc",

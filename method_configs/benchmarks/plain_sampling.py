@@ -41,7 +41,7 @@ def _network_input(
         vae.encode(pixels)
         return vae.encode(pixels)
 
-    encoded_twice(image_vae, images)  # the clean latents, which noise takes the place of when sampling
+    encoded_twice(image_vae, images)  # clean latents, which the original makes too, though sampling starts from noise
     encoded_twice(raymap_vae, raymaps01)
     masked_images = encoded_twice(image_vae, only_known(images, image_known))
     masked_rays = encoded_twice(raymap_vae, only_known(raymaps01, rays_known))

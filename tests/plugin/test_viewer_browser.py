@@ -114,18 +114,25 @@ def training(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Training]:
         thread.join(timeout=60)
 
 
-@pytest.fixture
-def page(training: Training) -> Iterator:
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
     with playwright.sync_playwright() as started:
         chromium = started.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        page = chromium.new_page(viewport={"width": 1000, "height": 1000})
-        page.set_default_timeout(SLOW)
-        page.received = []
-        page.on("websocket", lambda socket: socket.on("framereceived", lambda frame: page.received.append(frame)))
-        page.goto(training.address, wait_until="load")
-        page.get_by_text("Complete from here").wait_for()
-        yield page
+        yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def page(training: Training, browser) -> Iterator:
+    """A window of its own for each test."""
+    page = browser.new_page(viewport={"width": 1000, "height": 1000})
+    page.set_default_timeout(SLOW)
+    page.received = []
+    page.on("websocket", lambda socket: socket.on("framereceived", lambda frame: page.received.append(frame)))
+    page.goto(training.address, wait_until="load")
+    page.get_by_text("Complete from here").wait_for()
+    yield page
+    page.close()
 
 
 def received(page, name: str) -> bool:

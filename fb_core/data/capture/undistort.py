@@ -31,7 +31,9 @@ _KEPT = 70.0  # degrees off the axis at the middle of a side, of a picture from 
 _FOCAL_RATIOS = (0.05, 20.0)  # of straight cameras over bent ones, for lenses that exist
 _WIDEST = 3.0  # tangent of the angle off the axis up to which a perspective lens is looked at (72 degrees)
 _TABLE, _STEPS = 4096, 4  # angles that the inverse of a fisheye starts from, and steps of Newton from there
-_TOUCHES_NOTHING = 1 - 1e-4  # OpenCV knows 32 places within a pixel: a neighbour weighs at least 1 / 1024
+# A resampled pixel is known where its mask is at least this. OpenCV interpolates in steps of 1/32 of a pixel, so an
+# unknown neighbour that takes part weighs at least 1/1024; the rest is rounding.
+_WHOLLY_KNOWN = 1 - 1e-4
 _logger = logging.getLogger(__name__)
 
 
@@ -92,7 +94,7 @@ def undistort(
         )
         return rearrange(torch.from_numpy(result), "h w c -> c h w")
 
-    return *wholly_known(image, mask, remapped, least=_TOUCHES_NOTHING), straight
+    return *wholly_known(image, mask, remapped, least=_WHOLLY_KNOWN), straight
 
 
 def straight_camera(camera: Pinholes, camera_model: str, distortion: dict[str, float]) -> Pinholes:

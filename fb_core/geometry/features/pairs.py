@@ -19,11 +19,11 @@ FEATURES = 2500
 """Of one photo at most."""
 _ALL_PAIRS = 16  # photos of which every pair is matched
 _PARTNERS = 12  # of each photo when there are more
-_RATIO = 0.8  # Lowe 2004
-_BEFORE_BOTH = 0.8  # of the matches on epipolar lines; with fewer before both cameras, the motion is doubtful
+_RATIO = 0.8  # most distance to a match, as a share of that to the second likeliest (ratio test of Lowe 2004)
+_IN_FRONT = 0.8  # least share of the matches on epipolar lines whose points lie in front of both cameras
 FEWEST_MATCHES = 16
 """Pairs with fewer verified matches say nothing."""
-# Of a photo's longer side: a match may miss by one pixel of a photo of this size, and by no less than one pixel
+# A match may miss its epipolar line by the longer side over this number, and by one pixel at least.
 _SIDE_PER_PIXEL = 700
 
 
@@ -233,7 +233,7 @@ def _motion(
         )
         if (kept[:, 0] > 0).sum() > best[2].sum():
             best = rotation, translation, kept[:, 0] > 0
-        if best[2].sum() >= _BEFORE_BOTH * near.sum():
+        if best[2].sum() >= _IN_FRONT * near.sum():
             break
     return best
 

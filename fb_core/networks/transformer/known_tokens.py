@@ -95,7 +95,7 @@ class Relation:
     kept: dict[Attention, list[KeysValues]] = field(default_factory=dict)
     """Keys and values of this stream, block by block, scene by scene; of known tokens alone."""
     last: Attention | None = None
-    """The attention that known tokens need not go beyond: nobody sees what becomes of them afterwards."""
+    """The last attention of the network: known tokens stop there, since nothing reads them afterwards."""
 
     def keep(self, attention: Attention, x: Float[Tensor, "1 row d"]) -> None:
         """Keep a block's keys and values."""
