@@ -33,8 +33,6 @@ class Forecast:
     """Seconds of stages by their names, in order."""
 
     stages: Mapping[str, float]
-    memory: int = 0
-    """Bytes that the process takes beside the model."""
 
     @property
     def total(self) -> float:
@@ -78,12 +76,15 @@ def forecast(
                 stages["self-consistency"] = _seconds_of_features(sides, [_pixels(photo) for photo in photos[:checked]])
     views = 0 if plan is None else sum(map(len, plan.passes.views))
     written = 4 * _READ * sum(map(_pixels, photos)) + _DRAW + _SHOWN * (len(photos) + views)
-    beside = memory_beside(photos) if model is None or model.device.type == "cpu" else 0  # on a GPU, it is the GPU's
-    return Forecast(stages=stages | {"writing": seconds_of_products(written)}, memory=beside)
+    return Forecast(stages=stages | {"writing": seconds_of_products(written)})
 
 
-def memory_beside(photos: Sequence[Photo]) -> int:
-    """Bytes that the process takes beside the model and what is trained: libraries, drawing, photos at full size."""
+def memory_beside(photos: Sequence[Photo], model: Fillerbuster | None = None) -> int:
+    """Bytes that the process takes beside the model and what is trained: libraries, drawing, photos at full size. 0
+    beside a model on a GPU, whose memory is another.
+    """
+    if model is not None and model.device.type != "cpu":
+        return 0
     return _PROCESS + int(_BYTES * 1e6 * sum(map(_pixels, photos)))
 
 

@@ -22,7 +22,7 @@ from fb_core.geometry.pose_solver.verdict import Arrangement
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.memory.budget import GIB, bound
 from fb_core.registration.choice import Registration
-from method_configs.commands.complete.forecast import Forecast
+from method_configs.commands.complete.forecast import Forecast, memory_beside
 from method_configs.commands.complete.options import POSES_AT_ONCE, CompleteOptions
 from method_configs.commands.complete.output import COMMAND
 from method_configs.commands.complete.plan import Plan
@@ -42,7 +42,7 @@ def announcement_of_work(
     """One sentence on what is about to be done, how long it may take and how much memory it needs."""
     unknown = sum(photo.camera is None for photo in photos)
     posed = "" if unknown == len(photos) else f" ({len(photos) - unknown} with known cameras)"
-    seconds, memory = forecast.total, forecast.memory
+    seconds, memory = forecast.total, memory_beside(photos, model)
     if model is None or (plan is None and unknown == 0):
         how = "known" if unknown == 0 else "features"
         return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {in_words(seconds, memory)}."
@@ -53,7 +53,8 @@ def announcement_of_work(
     named = f"{name} ({model.model_hash[:8]})"
     if plan is None:
         return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {in_words(seconds, memory)}."
-    memory = max(memory, forecast.memory + _memory(model, plan.longest, plan.side, plan.sampling, options.prompt))
+    passing = _memory(model, plan.longest, plan.side, plan.sampling, options.prompt)
+    memory = max(memory, memory_beside(photos, model) + passing)
     count = len(plan.passes.views)
     passes = (
         f"{count} {'pass' if count == 1 else 'passes'} of {plan.sampling.steps} steps over up to {plan.longest} views"
