@@ -21,6 +21,7 @@ from torch import Tensor
 from fb_core.data.media import to_linear, to_srgb
 from fb_core.data.meshes.triangle_caster import TriangleHits, cast_triangles
 from fb_core.geometry.cameras import Pinholes
+from fb_core.machine.vtk_drawing import pyvista_off_screen
 
 if TYPE_CHECKING:
     import trimesh
@@ -228,8 +229,7 @@ def draw_with_pyvista(
     parts: list[trimesh.Trimesh], cameras: Pinholes, light: Lighting, *, supersample: int = 2
 ) -> Float[Tensor, "n 3 h w"]:
     """The same by VTK, off-screen, with smooth shading. Principal points must be central and pixels square."""
-    import pyvista
-
+    pyvista = pyvista_off_screen()
     plotter = pyvista.Plotter(
         off_screen=True, window_size=[cameras.width * supersample, cameras.height * supersample], lighting="none"
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from fb_core.data.capture.point_cloud import Points
 from fb_core.data.media import shrink
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.paths import up_of
+from fb_core.machine.vtk_drawing import pyvista_off_screen
 
 PHOTO_COLOR, NEW_COLOR = "#d9541e", "#1f6fb4"
 _ELEVATION_DEGREES, _LENS_DEGREES = 35.0, 30.0
@@ -54,13 +54,7 @@ def draw_cameras(
     """
     if not cameras:
         raise ValueError("camera figure: expected at least one camera, got none")
-    with suppress(ImportError):  # loaded after VTK has drawn by Mesa, its LLVM ends the process (triton 3.9, VTK 9)
-        import triton  # noqa: F401
-    import pyvista
-    import vtk
-
-    vtk.vtkObject.GlobalWarningDisplayOff()  # about the screen that is not there
-    vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_OFF)
+    pyvista = pyvista_off_screen()
     upright = _upright_axes(up_of(list(cameras)))
     photos = [_turned(one, upright) for one in cameras]
     fly = None if new is None else _turned(new, upright)
