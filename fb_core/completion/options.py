@@ -127,8 +127,8 @@ class CompletionConfig:
     one).
     """
     samples: int = 1
-    """Samples of every generated view, of which in every neighbourhood the one nearest to their mean is taken. Several
-    cost so many times the steps (known views only once) and tell how far they differ (`trust` measured).
+    """Samples of every generated view, of which in every neighbourhood the one nearest to their mean is taken (from 3
+    on; two are equally near). They cost so many times the steps (known views only once) and tell how far they differ.
     """
     guidance_unknown: float | None = None
     """Guidance scale in unknown pixels; None is what the model's folder recommends (the paper's 7 where it says

@@ -282,7 +282,7 @@ def test_check_runs():
 def test_eval_in_miniature(tmp_path):
     from helpers.tiny_models import save_tiny_model
 
-    from fb_core.evaluation.completion import METHODS, mean_of, started_at
+    from fb_core.evaluation.completion import METHODS, likeliest_of, mean_of, started_at
 
     arguments = [
         "--model",
@@ -305,7 +305,7 @@ def test_eval_in_miniature(tmp_path):
         ["eval", "rooms", *arguments, "--json", str(tmp_path / "eval.json"), "--sheet", str(tmp_path / "sheet.png")]
     )
     rows = json.loads((tmp_path / "eval.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == [*METHODS, started_at(0.5), mean_of(2)] * 2
+    assert [row["method"] for row in rows] == [*METHODS, started_at(0.5), mean_of(2), likeliest_of(2)] * 2
     assert [row["guidance"] for row in rows[::7]] == [1.0, 2.0]
     assert [row["strength"] for row in rows if row["method"].startswith("model")] == [1.0, 0.5] * 2
     assert (tmp_path / "sheet.png").stat().st_size > 1000

@@ -265,15 +265,16 @@ class Reconstruction:
 
     def _plane_doubt(self, matches: Matches) -> str:
         """What speaks against all cameras if all photos show one plane; empty if they do not."""
-        scale = [
-            self.lenses.focal[lens] / one.tolerance for lens, one in zip(self.lenses.lens, self.photos, strict=True)
-        ]
+        pairs = zip(self.lenses.lens, self.photos, strict=True)
+        scale = [self.lenses.focal[lens] / one.tolerance for lens, one in pairs]
         shown = [trust.flat(scale[i] * first, scale[j] * second) for (i, j), first, second in self._placed(matches)]
         if any(photo.known for photo in self.photos) or not any(shown) or False in shown:
             return ""
-        own = self._own_to_tell & self.registered
-        untold = {int(lens) for lens in self.lenses.lens[self.registered & ~own] if not self.lenses.believed[lens]}
-        return trust.plane_doubt(int(self.registered.sum()), int(own.sum()) + len(untold))
+        own, count, used = self._own_to_tell & self.registered, int(self.registered.sum()), self.lenses.lens
+        untold = {int(lens) for lens in used[self.registered & ~own] if not self.lenses.believed[lens]}
+        if not self.lenses.believed.any() and trust.borne_out(count, len(set(used[self.registered]))):
+            return ""
+        return trust.plane_doubt(count, int(own.sum()) + len(untold))
 
     @property
     def bad_tags(self) -> Bool[np.ndarray, " l"]:

@@ -40,6 +40,7 @@ _MOST_FOCAL = 0.05  # relative deviation of a focal length that is not named as 
 _ON_THE_LINE, _LEAST_AGREEING = 2.0, 0.6  # tolerances; share of the matches
 _EXACT = 1e12  # inverse variance of what is known
 _DROPPED = 0.1  # share of the cameras that leave the reference at once
+_CHANCE = 3  # numbers that agree although nothing asks them to: seldom by chance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,6 +239,13 @@ def surplus_of_a_plane(photos: int, focal_lengths: int) -> int:
     tells. The plane asks for three; the world's place, turn and scale for none of seven.
     """
     return 8 * (photos - 1) - (6 * photos + focal_lengths + 3 - 7)
+
+
+def borne_out(photos: int, lenses: int) -> bool:
+    """Whether photos of a plane that so few lenses explain tell so much more that lenses of their own, which would
+    explain all of it as well, need not be thought of.
+    """
+    return surplus_of_a_plane(photos, lenses) >= _CHANCE
 
 
 def plane_doubt(photos: int, focal_lengths: int) -> str:

@@ -20,7 +20,7 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features.bundle_adjustment import adjust, radial, straightened
 from fb_core.geometry.features.chain import FeatureCameras, chain
 from fb_core.geometry.features.pairs import PhotoFeatures
-from fb_core.geometry.features.trust import deviations_of, flat, plane_doubt, surplus_of_a_plane
+from fb_core.geometry.features.trust import borne_out, deviations_of, flat, plane_doubt, surplus_of_a_plane
 from fb_core.geometry.pose_solver.verdict import Arrangement
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -153,6 +153,16 @@ def test_four_photos_of_a_wall_do_not_tell_which_of_them_lies():
     points[:, 1] = 3.0
     found = chain(photos_of(zoomed(views, [1.0, 1.0, 1.3, 1.0]), points, told=500.0, noise=0.6))
     assert not any(found.trusted) and "photos of a plane" in found.reasons[0], found.reasons
+
+
+def test_one_lens_that_explains_four_photos_of_a_wall_is_believed_without_tags():
+    """Three numbers agree that need not; lenses of their own would explain as much, and nobody would think of them."""
+    views, points = wall_views(4)
+    found = chain(photos_of(views, points, noise=0.3))
+    assert all(found.trusted), found.reasons
+    assert not false_oks(found, views)
+    assert [borne_out(photos, 1) for photos in (2, 3, 4)] == [False, False, True]
+    assert not borne_out(4, 4) and not borne_out(4, 2)
 
 
 @pytest.mark.parametrize(
