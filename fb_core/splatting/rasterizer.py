@@ -2,6 +2,29 @@
 
 It stands in for gsplat where there is no CUDA. The steps: project (`projection`), choose what can be seen and put it in
 depth order, colours (`spherical_harmonics`), lists by cell (`cells`), compositing (`compositing`).
+
+Arguments of `rasterization`, whose shapes stand in its signature:
+    means: centres, world units.
+    quats: rotations (wxyz) of any length; a zero quaternion is the identity rotation with a zero gradient.
+    scales: standard deviations along the Gaussians' axes, world units (already exponentiated).
+    opacities: in [0, 1] (already through the sigmoid).
+    colors: d channels, or spherical-harmonics coefficients where `sh_degree` (0 to 4) is given; for all cameras or
+        each.
+    viewmats: world to camera, OpenCV axes (x right, y down, z forward).
+    Ks: pinhole matrices in pixels; pixel centres lie at +0.5. No gradient flows to them.
+    near_plane: Gaussians with a smaller camera z are not drawn. far_plane: nor those with a greater one.
+    radius_clip: Gaussians whose radius is at most this many pixels are not drawn.
+    eps2d: blur added to every screen covariance, square pixels.
+    tile_size: a multiple of 4; in gsplat 1.4 the picture depends on it, because the three-sigma square of a Gaussian is
+        rounded up to whole tiles.
+    backgrounds: colour behind everything, for each camera; the depth channel's background is 0.
+    render_mode: D is the sum of weight times z, ED that sum over alpha; RGB+D and RGB+ED append it as the last channel.
+    absgrad: backward also sets `meta["means2d"].absgrad`, the sum over pixels of |d loss / d mean2d|.
+    rasterize_mode: "antialiased" multiplies the opacities by sqrt(det before blur / det after it).
+    covars: covariances in place of quats and scales.
+    semantics: the version of gsplat to agree with.
+    engine: what lists and composites: torch, the compiled library (see `compiled.library`), or auto: the library where
+        it has been made and fits (at most 15 channels), else torch. They agree within rounding.
 """
 
 from __future__ import annotations
@@ -9,7 +32,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -55,31 +78,7 @@ def rasterization(
     semantics: Literal["1.4", "1.5", "1.6"] = "1.4",
     engine: Engine = "auto",
 ) -> tuple[Float[Tensor, "c h w x"], Float[Tensor, "c h w 1"], dict[str, Any]]:
-    """Images of Gaussians, (colors, alphas, meta), as gsplat 1.4.0 draws them.
-
-    Args:
-        means: centres, world units.
-        quats: rotations (wxyz) of any length; a zero quaternion is the identity rotation with a zero gradient.
-        scales: standard deviations along the Gaussians' axes, world units (already exponentiated).
-        opacities: in [0, 1] (already through the sigmoid).
-        colors: d channels, or spherical-harmonics coefficients where `sh_degree` (0 to 4) is given; for all cameras or
-            each.
-        viewmats: world to camera, OpenCV axes (x right, y down, z forward).
-        Ks: pinhole matrices in pixels; pixel centres lie at +0.5. No gradient flows to them.
-        near_plane: Gaussians with a smaller camera z are not drawn. far_plane: nor those with a greater one.
-        radius_clip: Gaussians whose radius is at most this many pixels are not drawn.
-        eps2d: blur added to every screen covariance, square pixels.
-        tile_size: a multiple of 4; in gsplat 1.4 the picture depends on it, because the three-sigma square of a
-            Gaussian is rounded up to whole tiles.
-        backgrounds: colour behind everything, for each camera; the depth channel's background is 0.
-        render_mode: D is the sum of weight times z, ED that sum over alpha; RGB+D and RGB+ED append it as the last
-            channel.
-        absgrad: backward also sets `meta["means2d"].absgrad`, the sum over pixels of |d loss / d mean2d|.
-        rasterize_mode: "antialiased" multiplies the opacities by sqrt(det before blur / det after it).
-        covars: covariances in place of quats and scales.
-        semantics: the version of gsplat to agree with.
-        engine: what lists and composites: torch, the compiled library (see `compiled.library`), or auto: the library
-            where it has been made and fits (at most 15 channels), else torch. They agree within rounding.
+    """Images of Gaussians as gsplat 1.4.0 draws them; what the arguments mean stands at the head of this module.
 
     Returns:
         colors [c, h, w, x], alphas [c, h, w, 1], and meta for gsplat's strategies (as with packed=False): `means2d` is
@@ -87,54 +86,63 @@ def rasterization(
         (`isect_*`, `flatten_ids`) are not made, since cells take their place. `dropped` counts the Gaussians left out
         because a value was not finite.
 
-    Raises:
-        ValueError: for shapes, dtypes or options that do not fit.
+    Raises ValueError for shapes, dtypes or options that do not fit.
     """
     splats = Gaussians(means=means, quats=quats, scales=scales, covars=covars, opacities=opacities)
     _check(splats, viewmats, Ks, backgrounds)
     _check_colors(splats, viewmats.shape[0], colors, backgrounds, sh_degree, render_mode)
     _check_options(width, height, packed, tile_size, rasterize_mode, semantics)
-    _check_numbers(
-        viewmats.shape[0] * width * height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        eps2d=eps2d,
-    )
-    settings = ProjectionSettings(
-        width=width,
-        height=height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        eps2d=eps2d,
-        antialiased=rasterize_mode == "antialiased",
-        semantics=SEMANTICS[semantics],
-    )
+    numbers = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d}
+    _check_numbers(viewmats.shape[0] * width * height, **numbers)
+    antialiased, rules = rasterize_mode == "antialiased", SEMANTICS[semantics]
+    settings = ProjectionSettings(width=width, height=height, antialiased=antialiased, semantics=rules, **numbers)
+    look = _Look(sh_degree, tile_size, backgrounds, render_mode, absgrad, engine)
     with single_thread():
-        usable, dropped = _usable(splats, _used_colors(colors, sh_degree, render_mode))
-        if usable is not None:
-            splats = replace(splats, opacities=opacities.masked_fill(~usable, 0.0))
-        projection = project_splats(splats, viewmats, Ks, usable, settings)
-        opacities = splats.opacities.expand(viewmats.shape[0], -1)
-        if settings.antialiased:
-            opacities = opacities * projection.compensations
-        chosen = _chosen(projection, opacities)
-        values = _values(means, colors, viewmats, projection.depths, chosen, sh_degree, render_mode)
-        grid = CellGrid(
-            cameras=viewmats.shape[0],
-            width=width,
-            height=height,
-            cell_width=CELL_WIDTH if tile_size % CELL_WIDTH == 0 else 4,
-        )
-        ellipses = _ellipses(
-            projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid
-        )
-        compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=absgrad)
-        images, alphas = _compositor(engine, values)(
-            projection.means2d, projection.conics, opacities, values, ellipses, compositing
-        )
-        images = _finish(images, alphas, backgrounds, render_mode)
+        return _drawn(splats, colors, viewmats, Ks, settings, look)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What of `rasterization`'s arguments says how the Gaussians look, and by what they are drawn."""
+
+    sh_degree: int | None
+    tile_size: int
+    backgrounds: Float[Tensor, "c d"] | None
+    render_mode: RenderMode
+    absgrad: bool
+    engine: Engine
+
+
+def _drawn(
+    splats: Gaussians,
+    colors: Tensor,
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    settings: ProjectionSettings,
+    look: _Look,
+) -> tuple[Float[Tensor, "c h w x"], Float[Tensor, "c h w 1"], dict[str, Any]]:
+    """What `rasterization` returns, of arguments that fit."""
+    usable, dropped = _usable(splats, _used_colors(colors, look.sh_degree, look.render_mode))
+    if usable is not None:
+        splats = replace(splats, opacities=splats.opacities.masked_fill(~usable, 0.0))
+    projection = project_splats(splats, viewmats, Ks, usable, settings)
+    opacities = splats.opacities.expand(viewmats.shape[0], -1)
+    if settings.antialiased:
+        opacities = opacities * projection.compensations
+    chosen, tile_size = _chosen(projection, opacities), look.tile_size
+    values = _values(splats.means, colors, viewmats, projection.depths, chosen, look.sh_degree, look.render_mode)
+    grid = CellGrid(
+        cameras=viewmats.shape[0],
+        width=settings.width,
+        height=settings.height,
+        cell_width=CELL_WIDTH if tile_size % CELL_WIDTH == 0 else 4,
+    )
+    ellipses = _ellipses(projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid)
+    compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=look.absgrad)
+    images, alphas = _compositor(look.engine, values)(
+        projection.means2d, projection.conics, opacities, values, ellipses, compositing
+    )
+    images = _finish(images, alphas, look.backgrounds, look.render_mode)
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
 
 
