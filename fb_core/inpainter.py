@@ -176,15 +176,10 @@ class Fillerbuster:
                 finite or far out of range, a prompt that the model cannot read, or too little memory however the work
                 is cut (saying what would fit).
         """
-        check_views(views)
-        if current is not None:
-            check_current(current, views)
-        sampling = self.recommended_sampling if sampling is None else sampling
-        text = self._text_of(prompt if sampling.guidance_text else None)
-        job = self._job(views, sampling, prompt)
+        job, start, text = self._asked(views, sampling, prompt, current)
         seed = None if resume is None else resume.seed
         seed = int(torch.randint(0, 2**62, (), generator=generator)) if seed is None else seed
-        denoising = self._denoising(job, self._start(job, current), text, seed)
+        denoising = self._denoising(job, start, text, seed)
         look = (
             None if on_progress is None else lambda at: on_progress(Progress(trajectory=at, image_vae=self.image_vae))
         )
@@ -215,16 +210,11 @@ class Fillerbuster:
         What is known is encoded, and shown to the network, once for all of them: known tokens that stand apart
         (`DiTConfig.known_tokens`) cost nothing in all samples but the first. Raises as `complete` does.
         """
-        check_views(views)
-        if current is not None:
-            check_current(current, views)
-        sampling = self.recommended_sampling if sampling is None else sampling
-        text = self._text_of(prompt if sampling.guidance_text else None)
-        job, denoising, answers = self._job(views, sampling, prompt), None, []
-        start = self._start(job, current)
+        job, start, text = self._asked(views, sampling, prompt, current)
+        denoising, answers = None, []
         for number, generator in enumerate(generators):
             seed = int(torch.randint(0, 2**62, (), generator=generator))
-            if denoising is None or sampling.sample_posterior:  # else nothing of what is known depends on the seed
+            if denoising is None or job.sampling.sample_posterior:  # else nothing of what is known depends on the seed
                 denoising = self._denoising(job, start, text, seed).bound()
             else:
                 height, width = denoising.noise.shape[-2:]
@@ -244,6 +234,18 @@ class Fillerbuster:
         """
         sampling = self.recommended_sampling.for_poses() if sampling is None else sampling
         return self.complete(Views.unposed(images), generator=generator, sampling=sampling).raymaps
+
+    def _asked(
+        self, views: Views, sampling: SamplingConfig | None, prompt: str | None, current: Views | None
+    ) -> tuple[_Job, Start, Float[Tensor, "texts words t"] | None]:
+        """What `complete` is asked, looked at and made ready."""
+        check_views(views)
+        if current is not None:
+            check_current(current, views)
+        sampling = self.recommended_sampling if sampling is None else sampling
+        text = self._text_of(prompt if sampling.guidance_text else None)
+        job = self._job(views, sampling, prompt)
+        return job, self._start(job, current), text
 
     def _text_of(self, prompt: str | None) -> Float[Tensor, "texts words t"] | None:
         """Embeddings of the empty prompt and, if there is one, of the prompt; None for a model without text."""
