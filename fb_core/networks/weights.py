@@ -1,6 +1,7 @@
 """Strict weights: a network takes a set of tensors exactly as named and shaped, or says which one does not fit."""
 
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
@@ -39,9 +40,17 @@ def require_shapes(where: str, module: nn.Module, shapes: Mapping[str, tuple[int
 def without_weights(build: Callable[[], Network]) -> Network:
     """The module that `build` makes, in evaluation mode and with parameters that occupy no memory until `adopt` gives
     them some.
+
+    Built in a thread of its own, where no Ctrl-C arrives: one that comes while torch initializes a parameter can leave
+    its thread's default device at "meta" for good (findings/torch_device_outlives_an_interruption.sh).
     """
-    with torch.device("meta"):
-        return build().eval()
+
+    def built() -> Network:
+        with torch.device("meta"):
+            return build().eval()
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(built).result()
 
 
 def require_plain(where: str, tensors: Mapping[str, Tensor]) -> None:
