@@ -130,19 +130,29 @@ class FillerbusterDataManager(CapturedViewsDatamanager):
 
     @property
     def generated_probability(self) -> float:
-        """Probability that a step draws a generated view."""
-        bank, most = self.generation.bank, self.config.completion.generated_share
-        return 0.0 if bank is None else bank.probability(most=most, captured=len(self.train_dataset))
+        """Probability that a step draws a generated view, beside its captured view or instead of it."""
+        bank, completion = self.generation.bank, self.config.completion
+        if bank is None:
+            return 0.0
+        share = bank.share(most=completion.generated_share, captured=len(self.train_dataset))
+        return share if completion.generated_steps == "shared" else share / (1 - share)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
-        """A captured or a generated view, decided by the completion's seed and the step."""
-        bank, completion = self.generation.bank, self.config.completion
+        """The views of a step, decided by the completion's seed and the step.
+
+        A captured one, whose batch has a generated one's camera and batch as ``beside`` where the step draws one; where
+        generated views share the steps, a captured or a generated one.
+        """
+        bank, completion, index = self.generation.bank, self.config.completion, None
         if bank is not None:
             index = bank.drawn(step, seed=completion.seed, probability=self.generated_probability)
-            if index is not None:
-                as_float = self.config.cache_images_type == "float32"
-                return bank.batch(index, as_float=as_float, weight=completion.view_weight)
-        return self.next_captured(step)
+        if bank is None or index is None:
+            return self.next_captured(step)
+        generated = bank.batch(index, as_float=self.config.cache_images_type == "float32")
+        if completion.generated_steps == "shared":
+            return generated
+        camera, batch = self.next_captured(step)
+        return camera, batch | {"beside": generated}
 
     # ------------------------------------------------------------------------------------------------------ generation
 

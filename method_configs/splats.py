@@ -126,6 +126,7 @@ def optimized_as_in_the_paper(config: TrainerConfig, method_name: str) -> Traine
         trust="full",
         densify_rounds=4,
         generated_share=0.5,
+        generated_steps="shared",
         generated_pixels="all",
         match_colors=False,
         seed_gaussians=False,

@@ -171,8 +171,12 @@ class CompletionConfig:
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Where the new cameras stand and look."""
     generated_share: float = 0.3
-    """Most of the steps that generated views may take; where they are fewer than the captured, all views are drawn
-    equally often.
+    """Most of the views drawn in training that may be generated ones; where these are fewer than the captured, all are
+    drawn equally often.
+    """
+    generated_steps: Literal["added", "shared"] = "added"
+    """Train on generated views beside the captured view of a step, which keep their number of steps, or (the paper)
+    instead of it.
     """
     generated_pixels: Literal["all", "unseen"] = "unseen"
     """Train only on the pixels of generated views that the capture has not seen, or on all (the paper); photographs
@@ -180,8 +184,6 @@ class CompletionConfig:
     """
     match_colors: bool = True
     """Shift the colours of generated views smoothly so that they meet the splats' where the capture has seen them."""
-    view_weight: float = 1.0
-    """Weight of a generated view's loss; captured views have 1."""
     trust: Literal["full", "measured"] = "measured"
     """Count generated views in full, or as far as the model is right about a few captured views that are hidden from it
     first.
@@ -242,8 +244,11 @@ class CompletionConfig:
             raise ValueError(f"completion.strength: expected a time above 0 and at most 1, got {self.strength}")
         if self.memory_budget is not None and not self.memory_budget > 0:
             raise ValueError(f"completion.memory_budget: expected a positive number of GiB, got {self.memory_budget}")
-        if self.view_weight < 0:
-            raise ValueError(f"completion.view_weight: expected 0 or more, got {self.view_weight}")
+        if self.generated_steps == "added" and self.generated_share > 0.5:
+            raise ValueError(
+                "completion.generated_share: expected at most 0.5, one generated view beside each captured one, got "
+                f"{self.generated_share}; more is possible with completion.generated_steps shared"
+            )
 
     @property
     def most_anchors(self) -> int:

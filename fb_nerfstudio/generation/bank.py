@@ -34,32 +34,31 @@ class Bank:
             shares = views.masks.double().mean(dim=(1, 2, 3)) * believed
         return Bank(views=views, cameras=to_nerfstudio(views.cameras, device), shares=tuple(shares.tolist()))
 
-    def probability(self, *, most: float, captured: int) -> float:
-        """Probability that a step draws from the bank: ``most``, or less where that would draw its views more often
-        than captured ones.
+    def share(self, *, most: float, captured: int) -> float:
+        """Of the views that are drawn, the share that comes from the bank: ``most``, or less where that would draw its
+        views more often than captured ones.
         """
         generated = sum(self.shares)  # a view of which only a third is trained on counts as a third of a view
         return min(most, generated / (generated + captured))
 
     def drawn(self, step: int, *, seed: int, probability: float) -> int | None:
-        """The view that a step draws, None for a captured one; decided by seed and step alone."""
+        """The view that a step draws with this probability, or None; decided by seed and step alone."""
         draws = np.random.default_rng([seed % 2**63, step])
         if draws.random() >= probability:
             return None
         return int(draws.choice(len(self.views), p=np.array(self.shares) / sum(self.shares)))
 
-    def batch(self, index: int, *, as_float: bool, weight: float) -> tuple[Cameras, dict[str, Any]]:
-        """Camera and batch of one view on the training's device; ``weight`` is that of a view's loss that is wholly
-        believed.
+    def batch(self, index: int, *, as_float: bool) -> tuple[Cameras, dict[str, Any]]:
+        """Camera and batch of one view on the training's device.
 
-        ``trust`` ([h, w, 1], 0 to 1), where it is known, weighs every pixel; else that of the whole view is part of
+        ``trust`` ([h, w, 1], 0 to 1), where it is known, weighs every pixel; else that of the whole view is
         ``view_weight``.
         """
         device, image = self.cameras.device, self.views.images[index]
         image = (image.float() / 255 if as_float else image).to(device)
-        batch = {"image": image, "mask": self.views.masks[index].to(device), "view_weight": weight}
+        batch = {"image": image, "mask": self.views.masks[index].to(device)}
         if self.views.trust is None:
-            batch["view_weight"] *= self.views.origins[index].trust
+            batch["view_weight"] = self.views.origins[index].trust
         else:
             batch["trust"] = self.views.trust[index].to(device).float() / 255
         return self.cameras[index : index + 1], batch

@@ -121,6 +121,7 @@ class FillerbusterSplatModel(SplatfactoModel):
             self.bil_grids = BilateralGrid(num=self.num_train_data, grid_X=x, grid_Y=y, grid_W=w)
         self.step = 0
         self.info: dict[str, Any] = {}
+        self.info_beside: dict[str, Any] | None = None
         self.crop_box: OrientedBox | None = None
         self.background_color = (
             torch.tensor(_VIEWER_BACKGROUND)
@@ -324,21 +325,41 @@ class FillerbusterSplatModel(SplatfactoModel):
         on.
 
         ``batch["view_weight"]`` (default 1) multiplies what this view contributes, ``batch["trust"]`` (default 1) what
-        each of its pixels does; neither touches the regularisers of the scene.
+        each of its pixels does; neither touches the regularisers of the scene. ``batch["beside"]``, if any, is the
+        camera and the batch of a second view of the same step, whose losses are named ``beside_...``.
         """
-        config, seen = self.config, self._supervision(outputs, batch)
-        losses = {
-            "main_loss": seen.photometric(outputs["rgb"], ssim_lambda=config.ssim_lambda),
-            "scale_reg": self._scale_regularization(),
-        }
-        if self.training and self._normals_wanted():
-            weights = {"alignment": config.normal_alignment_weight, "tv": config.normal_tv_weight}
-            losses |= seen.normals(outputs["normal"], outputs["surface_normal"], weights, form=config.normal_alignment)
+        config = self.config
+        losses = self._view_losses(outputs, batch) | {"scale_reg": self._scale_regularization()}
         if self.training:
+            if "beside" in batch:
+                losses |= self._losses_beside(*batch["beside"])
             self.camera_optimizer.get_loss_dict(losses)
             if config.use_bilateral_grid:
                 losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def _view_losses(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """What one view says of the scene."""
+        config, seen = self.config, self._supervision(outputs, batch)
+        losses = {"main_loss": seen.photometric(outputs["rgb"], ssim_lambda=config.ssim_lambda)}
+        if self.training and self._normals_wanted():
+            weights = {"alignment": config.normal_alignment_weight, "tv": config.normal_tv_weight}
+            losses |= seen.normals(outputs["normal"], outputs["surface_normal"], weights, form=config.normal_alignment)
+        return losses
+
+    def _losses_beside(self, camera: Cameras, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Those of a second view, whose screen gradients are counted after the backward pass as well."""
+        first = self.info
+        losses = self._view_losses(self(camera), batch)
+        self.info, self.info_beside = first, self.info
+        return {f"beside_{name}": loss for name, loss in losses.items()}
+
+    def step_post_backward(self, step: int) -> None:
+        """Called after an iteration: the strategy counts what was drawn, and refines when it is time."""
+        if self.info_beside is not None:
+            self.strategy.count(self.gauss_params, self.strategy_state, step, self.info_beside)
+            self.info_beside = None
+        super().step_post_backward(step)
 
     def _scale_regularization(self) -> Float[Tensor, ""]:
         """Penalty on needles (PhysGaussian), every tenth step if it is on at all."""

@@ -22,6 +22,11 @@ class CappedStrategy(DefaultStrategy):
     max_gaussians: int | None = None
     """Most Gaussians that densification may leave; None for no limit."""
 
+    def count(self, params: Any, state: dict[str, Any], step: int, info: dict[str, Any]) -> None:
+        """Count the screen gradients of one more render of this step (``info``), before `step_post_backward`."""
+        if step < self.refine_stop_iter:
+            self._update_state(params, state, info)
+
     @torch.no_grad()
     def _grow_gs(
         self, params: Any, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any], step: int

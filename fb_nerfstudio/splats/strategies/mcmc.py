@@ -102,6 +102,9 @@ class CappedMCMC(MCMCStrategy):
         """Nothing is kept between steps; takes what the default strategy takes."""
         return {}
 
+    def count(self, params: Any, state: dict[str, Any], step: int, info: dict[str, Any]) -> None:
+        """Nothing is counted: the gradient that `step_post_backward` reads is that of all renders of the step."""
+
     def step_post_backward(
         self,
         params: Any,

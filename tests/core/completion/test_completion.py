@@ -227,7 +227,7 @@ def test_the_saved_folder_is_a_valid_capture_that_says_how_it_was_made(tmp_path:
         ("generated_share", 1.5),
         ("steps", 0),
         ("at_step", -1),
-        ("view_weight", -1.0),
+        ("generated_share", 0.6),
     ],
 )
 def test_nonsense_options_are_refused(option: str, value):
