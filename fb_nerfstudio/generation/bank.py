@@ -56,7 +56,7 @@ class Bank:
         """
         device, image = self.cameras.device, self.views.images[index]
         image = (image.float() / 255 if as_float else image).to(device)
-        batch = {"image": image, "mask": self.views.masks[index].to(device)}
+        batch: dict[str, Any] = {"image": image, "mask": self.views.masks[index].to(device)}
         if self.views.trust is None:
             batch["view_weight"] = self.views.origins[index].trust
         else:

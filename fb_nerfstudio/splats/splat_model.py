@@ -24,10 +24,8 @@ from fb_core.evaluation.metrics.lazy_lpips import LazyLpips
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.normals import normal_picture, normals_from_depth
 from fb_core.geometry.rotations import flip_axes
-from fb_core.masks import resampled
 from fb_core.splatting.normal_losses import blended_normals, gaussian_normals
 from fb_core.splatting.spherical_harmonics import sh_colors
-from fb_nerfstudio.bridge import batch_image
 from fb_nerfstudio.splats.backend import render_splats
 from fb_nerfstudio.splats.drawn_camera import one_pinhole, shrunk, with_unit_axes
 from fb_nerfstudio.splats.gaussians import colors_of, evenly_chosen, first_gaussians, gaussians_at, require_points
@@ -35,7 +33,7 @@ from fb_nerfstudio.splats.panoramas import draw_panorama, is_panorama
 from fb_nerfstudio.splats.strategies.choice import strategy_of
 from fb_nerfstudio.splats.strategies.densification import append_rows
 from fb_nerfstudio.splats.strategies.mcmc import penalize
-from fb_nerfstudio.splats.supervision import Supervision, empty_outputs, needles
+from fb_nerfstudio.splats.supervision import Supervision, empty_outputs, known_colors_smaller, known_share, needles
 
 logger = logging.getLogger(__name__)
 
@@ -369,34 +367,14 @@ class FillerbusterSplatModel(SplatfactoModel):
 
     def _supervision(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> Supervision:
         """What the batch says of a render, at the current resolution."""
-        return Supervision(
-            target=self._target(outputs, batch),
-            known=self._known(batch),
-            trust=self._downscale_if_required(batch["trust"].float()).to(self.device) if "trust" in batch else None,
-            weight=batch.get("view_weight", 1.0),
-        )
-
-    def _target(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> Float[Tensor, "h w 3"]:
-        """The batch's picture at the current resolution."""
-        image = batch["image"]
-        if (
-            "mask" in batch and image.shape[-1] == 3 and self._get_downscale_factor() > 1
-        ):  # unknown colours must not be mixed in
-            mask = batch["mask"].reshape(1, *image.shape[:2]).float()
-            smaller = resampled(
-                batch_image(batch), mask, lambda both: self._downscale_if_required(both.movedim(0, -1)).movedim(-1, 0)
-            )
-            return smaller[0].movedim(0, -1).to(self.device)
-        return self.composite_with_background(self.get_gt_img(image), outputs["background"])
-
-    def _known(self, batch: dict[str, Any]) -> Float[Tensor, "h w 1"] | None:
-        """The batch's mask at the current resolution; fractions where a block is known in part."""
-        if "mask" not in batch:
-            return None
-        mask, size = batch["mask"], tuple(batch["image"].shape[:2])
-        if tuple(mask.shape[:2]) != size:
-            raise ValueError(f"batch['mask']: expected the image's size {size}, got {tuple(mask.shape[:2])}")
-        return self._downscale_if_required(mask.reshape(*size, 1).float()).to(self.device)
+        image, smaller = batch["image"], lambda picture: self._downscale_if_required(picture).to(self.device)
+        if "mask" in batch and image.shape[-1] == 3 and self._get_downscale_factor() > 1:
+            target = known_colors_smaller(batch, smaller)
+        else:
+            target = self.composite_with_background(self.get_gt_img(image), outputs["background"])
+        trust = smaller(batch["trust"].float()) if "trust" in batch else None
+        weight = batch.get("view_weight", 1.0)
+        return Supervision(target=target, known=known_share(batch, smaller), trust=trust, weight=weight)
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Any]) -> dict[str, Any]:

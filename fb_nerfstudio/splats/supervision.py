@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.geometry.normals import normals_of_picture
+from fb_core.masks import resampled
 from fb_core.splatting import photometric
 from fb_core.splatting.normal_losses import alignment_loss, total_variation
+from fb_nerfstudio.bridge import batch_image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +80,26 @@ class Supervision:
         pair = (image, self.target) if known is None else (image * known, self.target * known)
         distance = lpips(*pair)
         return metrics if distance is None else metrics | {"lpips": distance}
+
+
+def known_share(batch: Mapping[str, Any], smaller: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w 1"] | None:
+    """How far each pixel of a batch is known, made ``smaller`` ([h, w, c]); None for a batch without a mask.
+
+    Raises ValueError for a mask of another size than the image's.
+    """
+    if "mask" not in batch:
+        return None
+    mask, size = batch["mask"], tuple(batch["image"].shape[:2])
+    if tuple(mask.shape[:2]) != size:
+        raise ValueError(f"batch['mask']: expected the image's size {size}, got {tuple(mask.shape[:2])}")
+    return smaller(mask.reshape(*size, 1).float())
+
+
+def known_colors_smaller(batch: Mapping[str, Any], smaller: Callable[[Tensor], Tensor]) -> Float[Tensor, "h w 3"]:
+    """The picture of a batch that has a mask, made ``smaller`` ([h, w, c]) without mixing unknown colours in."""
+    mask = batch["mask"].reshape(1, *batch["image"].shape[:2]).float()
+    image, _ = resampled(batch_image(dict(batch)), mask, lambda both: smaller(both.movedim(0, -1)).movedim(-1, 0))
+    return image.movedim(0, -1)
 
 
 def needles(log_scales: Float[Tensor, "m 3"], most: float) -> Float[Tensor, ""]:

@@ -108,7 +108,7 @@ def test_a_run_without_completion_is_plain_nerfstudio(tiny_capture: Path):
 
 
 def test_batches_have_what_the_splat_model_reads(tiny_capture: Path):
-    manager = make(tiny_capture, options(view_weight=0.25))
+    manager = make(tiny_capture, options(generated_steps="shared"))
     generated(manager)
     kinds = {}
     for step in range(60):
@@ -117,9 +117,36 @@ def test_batches_have_what_the_splat_model_reads(tiny_capture: Path):
     camera, batch = kinds["generated"]
     assert camera.shape == (1,) and not (camera.metadata or {})
     assert batch["image"].shape == (16, 16, 3) and batch["image"].dtype == torch.uint8
-    assert batch["mask"].shape == (16, 16, 1) and batch["view_weight"] == 0.25
+    assert batch["mask"].shape == (16, 16, 1) and batch["view_weight"] == 1.0
     camera, batch = kinds["real"]
     assert batch["image"].dtype == torch.uint8 and batch["image"].shape == (32, 48, 3) and "view_weight" not in batch
+    assert "beside" not in batch
+
+
+def test_captured_views_keep_their_steps(tiny_capture: Path):
+    """Every step draws the captured view that it draws without completion; generated ones come beside it, in the same
+    proportion to them as where they share the steps.
+    """
+    plain, added, shared = (
+        make(tiny_capture, options(**changes))
+        for changes in (
+            {"enabled": False},
+            {"generated_share": 0.4},
+            {"generated_share": 0.4, "generated_steps": "shared"},
+        )
+    )
+    for manager in (plain, added, shared):
+        generated(manager)
+    drawn, drawn_shared = draws(added, range(600)), draws(shared, range(600))
+    assert [one for one in drawn if isinstance(one, int)] == draws(plain, range(600))
+    beside = [one for one in drawn if isinstance(one, str)]
+    assert set(beside) == {one for one in drawn_shared if isinstance(one, str)} and len(set(beside)) == 6
+    assert len(beside) / 600 == pytest.approx(added.generated_probability, abs=0.08)
+    assert added.generated_probability == pytest.approx(
+        shared.generated_probability / (1 - shared.generated_probability)
+    )
+    camera, batch = next(batch["beside"] for _, batch in map(added.next_train, range(600, 700)) if "beside" in batch)
+    assert not (camera.metadata or {}) and batch["image"].shape == (16, 16, 3) and batch["mask"].shape == (16, 16, 1)
 
 
 def test_a_memory_budget_reaches_the_sampler_and_what_does_not_fit_is_one_sentence(tiny_capture: Path, monkeypatch):
@@ -148,14 +175,14 @@ def test_a_capture_without_points_starts_from_its_photos(tiny_capture: Path):
 
 
 def test_float_caches_give_float_generated_images(tiny_capture: Path):
-    manager = make(tiny_capture, options(generated_share=1.0), cache_images_type="float32")
+    manager = make(tiny_capture, options(generated_share=1.0, generated_steps="shared"), cache_images_type="float32")
     generated(manager)
     images = [batch["image"] for camera, batch in map(manager.next_train, range(30)) if not camera.metadata]
     assert images and images[0].dtype == torch.float32 and 0 <= float(images[0].min()) <= float(images[0].max()) <= 1
 
 
 def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(tiny_capture: Path):
-    manager = make(tiny_capture, options(generated_share=1.0))
+    manager = make(tiny_capture, options(generated_share=1.0, generated_steps="shared"))
     generated(manager)
     bank = manager.generated_views
     masks = torch.zeros_like(bank.masks)
@@ -173,7 +200,7 @@ def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(t
 
 @pytest.mark.parametrize(("share", "expected"), [(0.2, 0.2), (1.0, 6 / 12), (0.0, 0.0)])
 def test_generated_views_are_drawn_with_the_stated_probability(tiny_capture: Path, share: float, expected: float):
-    manager = make(tiny_capture, options(generated_share=share, generated_pixels="all"))
+    manager = make(tiny_capture, options(generated_share=share, generated_steps="shared", generated_pixels="all"))
     generated(manager)
     assert manager.generated_probability == pytest.approx(expected)
     seen = draws(manager, range(400))

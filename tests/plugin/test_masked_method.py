@@ -55,7 +55,7 @@ def test_masked_pictures_are_inpainted_at_full_size_and_supervise_their_holes(ti
 
 
 def test_captured_pictures_are_drawn_as_before_and_copies_by_their_holes(tiny_capture: Path):
-    manager = make(tiny_capture, inpainting(generated_share=1.0))
+    manager = make(tiny_capture, inpainting(generated_share=1.0, generated_steps="shared"))
     generated(manager)
     holes = 3 * 10 * 22 / (32 * 48)
     assert manager.generated_probability == pytest.approx(holes / (holes + 6))

@@ -304,12 +304,12 @@ def test_the_bank_gives_trust_by_pixel_and_draws_by_what_is_believed() -> None:
     trust = torch.zeros(16, 16)
     trust[:, :4] = 0.8
     bank = Bank.of(with_map(trust), "cpu")
-    _, batch = bank.batch(0, as_float=False, weight=0.5)
-    assert batch["view_weight"] == 0.5 and batch["trust"].shape == (16, 16, 1)
+    _, batch = bank.batch(0, as_float=False)
+    assert "view_weight" not in batch and batch["trust"].shape == (16, 16, 1)
     assert torch.allclose(batch["trust"][..., 0], trust, atol=2e-3)
     assert bank.shares[0] == pytest.approx(0.2, abs=1e-3)
     nothing = Bank.of(with_map(torch.zeros(16, 16)), "cpu")
-    assert nothing.probability(most=0.5, captured=3) == 0 and nothing.drawn(7, seed=0, probability=0.0) is None
+    assert nothing.share(most=0.5, captured=3) == 0 and nothing.drawn(7, seed=0, probability=0.0) is None
 
 
 def test_pixel_trust_survives_checkpoints_folders_and_the_way_back(tmp_path) -> None:

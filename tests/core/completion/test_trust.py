@@ -92,10 +92,9 @@ def test_the_same_seed_measures_the_same() -> None:
 
 def test_less_believed_views_are_drawn_more_seldom_and_their_loss_counts_less() -> None:
     full, half = Bank.of(views_of(1.0), "cpu"), Bank.of(views_of(0.5), "cpu")
-    assert full.probability(most=1.0, captured=6) == pytest.approx(3 / 9) and half.probability(
-        most=1.0, captured=6
-    ) == pytest.approx(1.5 / 7.5)
-    assert half.batch(0, as_float=False, weight=0.8)[1]["view_weight"] == pytest.approx(0.4)
+    assert full.share(most=1.0, captured=6) == pytest.approx(3 / 9)
+    assert half.share(most=1.0, captured=6) == pytest.approx(1.5 / 7.5)
+    assert half.batch(0, as_float=False)[1]["view_weight"] == pytest.approx(0.5)
 
 
 def test_trust_survives_a_checkpoint_and_the_run_s_folder(tmp_path) -> None:

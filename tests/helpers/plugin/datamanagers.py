@@ -141,12 +141,13 @@ def generated(
 
 
 def draws(manager: FillerbusterDataManager, steps: range) -> list[int | str]:
-    """Which view each step draws: the captured index, or "g" and the generated picture's sum."""
+    """Which views the steps draw: captured ones' indices, and "g" with the sum of a generated one's pose."""
     result = []
     for step in steps:
-        camera, _ = manager.next_train(step)
-        cam_idx = (camera.metadata or {}).get("cam_idx")
-        result.append(cam_idx if cam_idx is not None else f"g{float(camera.camera_to_worlds.sum()):.5f}")
+        camera, batch = manager.next_train(step)
+        for drawn in (camera, *batch.get("beside", ())[:1]):
+            index = (drawn.metadata or {}).get("cam_idx")
+            result.append(index if index is not None else f"g{float(drawn.camera_to_worlds.sum()):.5f}")
     return result
 
 

@@ -118,7 +118,7 @@ def names(dataset: Any) -> set[str]:
 
 
 def test_generated_frames_are_in_the_bank_and_nowhere_else(capture: Path, tmp_path: Path, said: list[str]):
-    manager = make(capture, generated_share=1.0, generated_pixels="all")
+    manager = make(capture, generated_share=1.0, generated_steps="shared", generated_pixels="all")
     attrs = attributes(manager, tmp_path / "run")
     run_callbacks(manager, attrs)
     photos = {f"photo_{index:03d}" for index in range(PHOTOS)}

@@ -99,6 +99,7 @@ def test_the_papers_optimisation_differs_in_what_the_paper_says() -> None:
             "trust": "full",
             "densify_rounds": 4,
             "generated_share": 0.5,
+            "generated_steps": "shared",
             "generated_pixels": "all",
         },
         **{"match_colors": False, "seed_gaussians": False},

@@ -253,6 +253,34 @@ def test_view_weight_multiplies_the_loss() -> None:
     assert model.get_loss_dict(outputs, batch | {"view_weight": 0.0})["main_loss"] == 0
 
 
+def test_a_view_beside_adds_its_losses_and_its_screen_gradients() -> None:
+    """To the bit what two renders and one backward pass give; without it nothing changes."""
+    other = make_batch() | {"view_weight": 0.5}
+    gradients, counted = [], []
+    for beside in (True, False):
+        model = make_model(background_color="black").train()
+        optimizers = make_optimizers(model)
+        model.step_cb(optimizers, 1)
+        batch = make_batch()
+        losses = model.get_loss_dict(model(camera()), batch | ({"beside": (camera(), other)} if beside else {}))
+        if beside:
+            first = dict(model.info)
+            assert losses["beside_main_loss"].item() == pytest.approx(0.5 * losses["main_loss"].item())
+            assert {name for name in losses if name.startswith("beside")} == {"beside_main_loss"}
+            total = losses["main_loss"] + losses["beside_main_loss"]
+            total.backward()
+            assert model.info_beside is not None and model.info["means2d"] is first["means2d"]
+        else:
+            assert model.info_beside is None
+            (1.5 * losses["main_loss"]).backward()
+        gradients.append(model.gauss_params["means"].grad.clone())
+        model.step_post_backward(1)
+        assert model.info_beside is None
+        counted.append(model.strategy_state["count"].clone())
+    assert torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-8)
+    assert torch.equal(counted[0], 2 * counted[1]) and int(counted[1].sum()) > 0
+
+
 def test_a_mask_of_another_size_is_refused() -> None:
     model = make_model().eval()
     with pytest.raises(ValueError, match="mask"):
