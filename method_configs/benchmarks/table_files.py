@@ -5,6 +5,7 @@ command goes on.
 from __future__ import annotations
 
 import csv as csv_format
+import hashlib
 import io
 import json as json_format
 import logging
@@ -59,13 +60,16 @@ class TableFiles:
         """What was measured before under this name for the same question, or is measured now and kept.
 
         Args:
-            name: of the file, without its suffix.
+            name: of the file, without its suffix; a digest of the question follows, so that one folder may keep the
+                answers to several.
             asked: all that decides the result, in what JSON can hold.
             measure: gives what JSON can hold.
         """
         if self.keep is None:
             return measure()
-        question, path = json_format.loads(json_format.dumps(asked)), self.keep / f"{name}.json"
+        question = json_format.loads(json_format.dumps(asked))
+        digest = hashlib.sha256(json_format.dumps(question, sort_keys=True).encode()).hexdigest()[:8]
+        path = self.keep / f"{name}-{digest}.json"
         if path.is_file():
             from fb_core.files.json_files import read_json
 
