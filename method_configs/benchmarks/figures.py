@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
+if TYPE_CHECKING:
+    from fb_core.evaluation.results import Report
+
+_LETTERS_PER_INCH = 27  # of the smallest print
 _logger = logging.getLogger(__name__)
 
 
@@ -25,10 +29,19 @@ def new_axes(label: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, whole or not at all, and say so."""
+def save_figure(figure: Any, path: Path, report: Report | None = None) -> None:
+    """Write a figure, whole or not at all, and say so; what made its ``report`` stands small below it."""
+    import textwrap
+
     from matplotlib import pyplot
 
+    if report is not None:
+        from method_configs.benchmarks.command import command_line
+        from method_configs.benchmarks.table_files import origin_of
+
+        origin = f"{command_line()}, {origin_of(report)}"
+        lines = textwrap.wrap(origin, int(_LETTERS_PER_INCH * figure.get_figwidth()))
+        figure.supxlabel("\n".join(lines), fontsize=5, color="gray", parse_math=False)
     with whole_file(path) as unfinished:
         figure.savefig(unfinished, dpi=150, metadata=signature(path))
     pyplot.close(figure)

@@ -147,6 +147,7 @@ class Inference(TableFiles):
             rows.append(
                 {
                     "part": f"inference with {preset} ({_weights(model)}), half of the views known",
+                    "model": _weights(model),
                     "size": cell.size, "views": cell.views, "steps": steps, "seconds": value, "how": how,
                     "tera_operations": 1e-12 * (cell.once + steps * cell.step),
                     "clock": self.clock, "device": str(model.device),
@@ -289,4 +290,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("views (hollow: reckoned by operations from fewer or smaller views)")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
-    save_figure(figure, path)
+    save_figure(figure, path, report)

@@ -108,8 +108,6 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def markdown_text(report: Report, command: str) -> str:
     """One table for each part, and below them what is needed to make them again."""
-    from fb_core.evaluation.results import commit, hardware
-
     lines = []
     for part in dict.fromkeys(row["part"] for row in report.rows):
         rows = [row for row in report.rows if row["part"] == part]
@@ -117,8 +115,17 @@ def markdown_text(report: Report, command: str) -> str:
         lines += [f"**{part}**", "", _line(name.replace("_", " ") for name in columns), _line("---" for _ in columns)]
         lines += [_line(_told(row.get(name)) for name in columns) for row in rows]
         lines.append("")
-    lines.append(f"`{command}`, commit {commit()}, seed {report.seed}, {hardware()}")
+    lines.append(f"`{command}`, {origin_of(report)}")
     return "\n".join(lines) + "\n"
+
+
+def origin_of(report: Report) -> str:
+    """What a table or a figure needs beside the command to be made again."""
+    from fb_core.evaluation.results import commit, hardware
+
+    models = sorted({row["model"] for row in report.rows if row.get("model", "-") != "-"})
+    told = f"model {', '.join(models)}, " if models else ""
+    return f"{told}commit {commit()}, seed {report.seed}, {hardware()}"
 
 
 def _line(cells: Any) -> str:

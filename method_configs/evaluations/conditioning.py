@@ -141,4 +141,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_xscale("log", base=2)
     axes.set_xticks(known, [str(count) for count in known])
     axes.set_xlabel("known views")
-    save_figure(figure, path)
+    save_figure(figure, path, report)

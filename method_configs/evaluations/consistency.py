@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from fb_core.evaluation.metrics.correspondences import Matcher
     from fb_core.evaluation.metrics.relative_rotation import PairResult
+    from fb_core.evaluation.results import Report
     from fb_core.geometry.cameras import Pinholes
     from method_configs.evaluations.true_films import Film
 
@@ -77,7 +78,7 @@ class Consistency(TableFiles):
                         {"part": part, "method": method, "capture": key[1], "model": model} | accuracy(judged[key])
                     )
         report.rows.extend(means(report.rows, poses))
-        self.publish(report, lambda _, figure: draw(judged, figure, self._matcher))
+        self.publish(report, lambda report, figure: draw(report, judged, figure, self._matcher))
 
     @property
     def _matcher(self) -> str:
@@ -249,7 +250,7 @@ def means(rows: Sequence[dict[str, Any]], poses: Mapping[str, str]) -> list[dict
     return result
 
 
-def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: str) -> None:
+def draw(report: Report, judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: str) -> None:
     """The share of pairs below each threshold, one curve for each method over all its captures."""
     import numpy as np
 
@@ -264,4 +265,4 @@ def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: s
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
-    save_figure(figure, path)
+    save_figure(figure, path, report)

@@ -272,4 +272,4 @@ def draw(report: Report, path: Path) -> None:
     labels = [f"{row['method']}\n{row['capture']}\n{row['normals']} normals" for row in rows]
     axes.bar(range(len(rows)), [row["psnr"] for row in rows], yerr=[row["psnr_interval"] for row in rows], capsize=4)
     axes.set_xticks(range(len(rows)), labels)
-    save_figure(figure, path)
+    save_figure(figure, path, report)

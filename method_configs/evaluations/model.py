@@ -217,4 +217,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend()
-    save_figure(figure, path)
+    save_figure(figure, path, report)

@@ -26,11 +26,13 @@ from fb_core.evaluation.metrics.relative_rotation import (
     true_rotation,
     wilson_interval,
 )
-from fb_core.evaluation.results import Report
+from fb_core.evaluation.results import Report, commit, hardware
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_nerfstudio.bridge import to_nerfstudio, to_pinholes
 from fb_nerfstudio.runs import finished_run
+from method_configs.benchmarks.command import command_line
+from method_configs.benchmarks.figures import new_axes, save_figure
 from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text
 from method_configs.evaluations.consistency import Consistency, poses_digest
 from method_configs.evaluations.true_films import TRUE_FILM, true_pictures
@@ -336,3 +338,13 @@ def test_tables_as_text():
     lines = markdown_text(Report(seed=5, rows=rows), "fillerbuster eval").splitlines()
     assert lines[2:6] == ["| name | value | more |", "| --- | --- | --- |", "| x\\|y | 0.123 | - |", "| z | - | 3 |"]
     assert "seed 5" in lines[-1] and "fillerbuster eval" in lines[-1]
+
+
+def test_a_figure_says_what_it_takes_to_make_it_again(tmp_path: Path):
+    rows = [{"part": "a", "model": hashed} for hashed in ("f9b4db88", "-", "0123abcd")]
+    figure, _ = new_axes("dB")
+    save_figure(figure, tmp_path / "figure.png", Report(seed=5, rows=rows))
+    told = figure.get_supxlabel().replace("\n", " ")
+    assert told.startswith(command_line().split()[0]) and "model 0123abcd, f9b4db88," in told
+    assert f"commit {commit()}" in told and "seed 5" in told and hardware() in told
+    assert (tmp_path / "figure.png").stat().st_size > 1000
