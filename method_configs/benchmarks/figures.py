@@ -30,7 +30,7 @@ def new_axes(label: str) -> tuple[Any, Any]:
 
 
 def save_figure(figure: Any, path: Path, report: Report | None = None) -> None:
-    """Write a figure, whole or not at all, and say so; what made its ``report`` stands small below it."""
+    """Write a figure, whole or not at all, and say so; what made its ``report`` stands small above it."""
     import textwrap
 
     from matplotlib import pyplot
@@ -41,7 +41,7 @@ def save_figure(figure: Any, path: Path, report: Report | None = None) -> None:
 
         origin = f"{command_line()}, {origin_of(report)}"
         lines = textwrap.wrap(origin, int(_LETTERS_PER_INCH * figure.get_figwidth()))
-        figure.supxlabel("\n".join(lines), fontsize=5, color="gray", parse_math=False)
+        figure.suptitle("\n".join(lines), fontsize=5, color="gray", parse_math=False)
     with whole_file(path) as unfinished:
         figure.savefig(unfinished, dpi=150, metadata=signature(path))
     pyplot.close(figure)

@@ -344,7 +344,7 @@ def test_a_figure_says_what_it_takes_to_make_it_again(tmp_path: Path):
     rows = [{"part": "a", "model": hashed} for hashed in ("f9b4db88", "-", "0123abcd")]
     figure, _ = new_axes("dB")
     save_figure(figure, tmp_path / "figure.png", Report(seed=5, rows=rows))
-    told = figure.get_supxlabel().replace("\n", " ")
+    told = figure.get_suptitle().replace("\n", " ")
     assert told.startswith(command_line().split()[0]) and "model 0123abcd, f9b4db88," in told
     assert f"commit {commit()}" in told and "seed 5" in told and hardware() in told
     assert (tmp_path / "figure.png").stat().st_size > 1000
