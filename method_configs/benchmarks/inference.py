@@ -31,7 +31,7 @@ _PAPER_STEPS = 50
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 _BYTES = 40  # of a pixel: colours, what is known, rays, in float32
 _FEW, _FEWEST = (4, 12), (1, 2)  # steps that are measured where the rest is reckoned
-_LONG, _TOO_LONG = 1e11, 4e12  # operations of a step beyond which fewest steps are measured, and none
+_LONG, _TOO_LONG = 1e11, 2.5e12  # operations of a step beyond which fewest steps are measured, and none
 _logger = logging.getLogger(__name__)
 
 
