@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
-
-if TYPE_CHECKING:
-    from fb_core.evaluation.results import Report
 
 _LETTERS_PER_INCH = 27  # of the smallest print
 _logger = logging.getLogger(__name__)
@@ -29,17 +26,13 @@ def new_axes(label: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def save_figure(figure: Any, path: Path, report: Report | None = None) -> None:
-    """Write a figure, whole or not at all, and say so; what made its ``report`` stands small above it."""
+def save_figure(figure: Any, path: Path, origin: str = "") -> None:
+    """Write a figure, whole or not at all, and say so; ``origin`` stands small above it."""
     import textwrap
 
     from matplotlib import pyplot
 
-    if report is not None:
-        from method_configs.benchmarks.command import command_line
-        from method_configs.benchmarks.table_files import origin_of
-
-        origin = f"{command_line()}, {origin_of(report)}"
+    if origin:
         lines = textwrap.wrap(origin, int(_LETTERS_PER_INCH * figure.get_figwidth()))
         figure.suptitle("\n".join(lines), fontsize=5, color="gray", parse_math=False)
     with whole_file(path) as unfinished:

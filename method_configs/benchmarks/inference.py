@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between, require_room
 from fb_core.machine.devices import chosen_device
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     import torch
@@ -290,4 +290,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("views (hollow: reckoned by operations from fewer or smaller views)")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
-    save_figure(figure, path, report)
+    save_figure(figure, path, origin_of(report))

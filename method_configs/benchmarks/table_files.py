@@ -115,17 +115,18 @@ def markdown_text(report: Report, command: str) -> str:
         lines += [f"**{part}**", "", _line(name.replace("_", " ") for name in columns), _line("---" for _ in columns)]
         lines += [_line(_told(row.get(name)) for name in columns) for row in rows]
         lines.append("")
-    lines.append(f"`{command}`, {origin_of(report)}")
+    lines.append(origin_of(report, f"`{command}`"))
     return "\n".join(lines) + "\n"
 
 
-def origin_of(report: Report) -> str:
-    """What a table or a figure needs beside the command to be made again."""
+def origin_of(report: Report, command: str = "") -> str:
+    """What a table or a figure needs to be made again; by default with this process's command."""
     from fb_core.evaluation.results import commit, hardware
+    from method_configs.benchmarks.command import command_line
 
     models = sorted({row["model"] for row in report.rows if row.get("model", "-") != "-"})
     told = f"model {', '.join(models)}, " if models else ""
-    return f"{told}commit {commit()}, seed {report.seed}, {hardware()}"
+    return f"{command or command_line()}, {told}commit {commit()}, seed {report.seed}, {hardware()}"
 
 
 def _line(cells: Any) -> str:

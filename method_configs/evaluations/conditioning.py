@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from fb_core.evaluation.capture_questions import CaptureViews
@@ -141,4 +141,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_xscale("log", base=2)
     axes.set_xticks(known, [str(count) for count in known])
     axes.set_xlabel("known views")
-    save_figure(figure, path, report)
+    save_figure(figure, path, origin_of(report))

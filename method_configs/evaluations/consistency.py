@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -265,4 +265,4 @@ def draw(report: Report, judged: dict[tuple[str, str], list[PairResult]], path: 
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
-    save_figure(figure, path, report)
+    save_figure(figure, path, origin_of(report))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from fb_core.evaluation.ablations import Asked
@@ -217,4 +217,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend()
-    save_figure(figure, path, report)
+    save_figure(figure, path, origin_of(report))

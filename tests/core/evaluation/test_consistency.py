@@ -33,7 +33,7 @@ from fb_nerfstudio.bridge import to_nerfstudio, to_pinholes
 from fb_nerfstudio.runs import finished_run
 from method_configs.benchmarks.command import command_line
 from method_configs.benchmarks.figures import new_axes, save_figure
-from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text
+from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text, origin_of
 from method_configs.evaluations.consistency import Consistency, poses_digest
 from method_configs.evaluations.true_films import TRUE_FILM, true_pictures
 
@@ -343,7 +343,7 @@ def test_tables_as_text():
 def test_a_figure_says_what_it_takes_to_make_it_again(tmp_path: Path):
     rows = [{"part": "a", "model": hashed} for hashed in ("f9b4db88", "-", "0123abcd")]
     figure, _ = new_axes("dB")
-    save_figure(figure, tmp_path / "figure.png", Report(seed=5, rows=rows))
+    save_figure(figure, tmp_path / "figure.png", origin_of(Report(seed=5, rows=rows)))
     told = figure.get_suptitle().replace("\n", " ")
     assert told.startswith(command_line().split()[0]) and "model 0123abcd, f9b4db88," in told
     assert f"commit {commit()}" in told and "seed 5" in told and hardware() in told
