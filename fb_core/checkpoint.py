@@ -32,6 +32,10 @@ from fb_core.networks.weights import adopt, require_names, require_shapes, witho
 FORMAT_VERSION = 1
 RELEASED_LICENSE = "CC BY-NC 4.0"
 CONFIG_FILE = "config.json"
+_REMEDY = (
+    "fillerbuster convert makes one of the authors' files (docs/weights.md says where they are), fillerbuster train of "
+    "data; without a folder the bundled model is used"
+)
 PROMPT_FILE = "empty-prompt.safetensors"
 PROMPT_KEY = "embedding"
 WEIGHT_FILES = {
@@ -205,9 +209,9 @@ def read_config(folder: str | os.PathLike[str]) -> tuple[ModelConfig, dict[str, 
     """Architecture and info of a model folder, without touching its weights. Raises ValueError as `load` does."""
     path = settled(Path(folder)) / CONFIG_FILE
     if not path.parent.is_dir():
-        raise ValueError(f"folder: expected a model folder, but there is no folder {path.parent}.")
+        raise ValueError(f"folder: expected a model folder, but there is no folder {path.parent}; {_REMEDY}")
     if not path.is_file():
-        raise ValueError(f"folder: {path.parent} is not a model folder because it has no {CONFIG_FILE}.")
+        raise ValueError(f"folder: {path.parent} is not a model folder because it has no {CONFIG_FILE}; {_REMEDY}")
     try:
         content = read_json(path)
     except ValueError as error:

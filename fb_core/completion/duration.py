@@ -69,9 +69,9 @@ def seconds_of(
         2 * (4 + 2 * config.mlp_ratio) * config.width**2 + 4 * config.width * tokens * window
     )  # projections; attention
     a_pass = config.depth * per_token * tokens * window
-    encoded = views * (_flops(model.image_vae, size)[0] + _flops(model.raymap_vae, size)[0])
+    encoded = views * (coding_flops(model.image_vae, size)[0] + coding_flops(model.raymap_vae, size)[0])
     decoder = model.raymap_vae if sequence.recovers_rays else model.image_vae
-    decoded = (views if sequence.recovers_rays else views - sequence.known) * _flops(decoder, size)[1]
+    decoded = (views if sequence.recovers_rays else views - sequence.known) * coding_flops(decoder, size)[1]
     rate = _rate(str(device), dtype)
     return _OVERHEAD * (branches * passes * a_pass + encoded + decoded) / rate
 
@@ -97,8 +97,8 @@ def in_words(seconds: float, memory: int | None = None) -> str:
 
 @lru_cache(maxsize=8)
 @torch.no_grad()
-def _flops(config: VAEConfig, size: int) -> tuple[int, int]:
-    """Of encoding and of decoding one view."""
+def coding_flops(config: VAEConfig, size: int) -> tuple[int, int]:
+    """Floating-point operations of encoding and of decoding one view of this side in pixels."""
     from torch.utils.flop_counter import FlopCounterMode
 
     vae = without_weights(lambda: VAE(config))

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fb_core.conditioning import Encoding, encode_in_chunks, encode_known, join, stacked_facts, unsplit
+from fb_core.conditioning import Encoding, encode_in_chunks, encode_known, stacked_facts, unsplit
 from fb_core.data.rooms.room import require_family
 from fb_core.evaluation.capture_questions import CaptureViews
 from fb_core.evaluation.completion import RoomViews, unseen_room
@@ -22,7 +22,7 @@ from fb_core.flow import validation_loss
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.masks import training_mixture
-from fb_core.networks.transformer.embeddings import index_positions
+from fb_core.networks.transformer.prepared import Prepared
 from fb_core.views import Views
 
 Distance = Callable[[Tensor, Tensor], Tensor]
@@ -150,11 +150,11 @@ def conditional_validation_loss(
         None
     ]
     noise = torch.randn(data.shape, generator=torch.Generator().manual_seed(seed)).to(data)
-    index = index_positions(model.dit.config.index, 1, data.shape[1], device=data.device)
     text = None if model.text is None else model.text[None]
+    prepared = Prepared(model.dit, conditioning.channels[None], (), text=text, facts=facts)  # the same at all times
 
     def network(state: Tensor, time: Tensor) -> Tensor:
-        return model.dit(join(state[0], conditioning)[None], time, text, index, facts)
+        return prepared(state[0], float(time))
 
     return float(validation_loss(network, data, noise, steps=times)[:, 0].mean())
 

@@ -5,6 +5,7 @@ of them is true.
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from fb_core.data.training.capture_sequences import (
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 
+_MOST_BYTES = 512 * 1024**2  # of scaled pictures that are kept
 _logger = logging.getLogger(__name__)
 
 
@@ -117,11 +119,42 @@ def readable_captures(folders: Sequence[Path], *, views: int) -> list[tuple[str,
     return kept
 
 
+class ScaledPictures:
+    """Crops of pictures, whose whole scaled pictures are kept while there is room: sequences of few captures show the
+    same ones again and again, and a large photo takes longer to read than its view to complete.
+    """
+
+    def __init__(self, most_bytes: int = _MOST_BYTES):
+        self._most_bytes, self._bytes = most_bytes, 0
+        self._kept: OrderedDict[tuple[Path, Path | None, int, int], tuple[Tensor, Tensor]] = OrderedDict()
+
+    def read(self, window: Window) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
+        """What ``window.read()`` gives."""
+        key = window.frame.image_path, window.frame.mask_path, window.width, window.height
+        if key not in self._kept:
+            self._kept[key] = window.scaled()
+            self._bytes += _bytes(self._kept[key])
+        self._kept.move_to_end(key)
+        found = self._kept[key]
+        while self._bytes > self._most_bytes:
+            self._bytes -= _bytes(self._kept.popitem(last=False)[1])
+        return window.cut_from(*found)
+
+
+def _bytes(pair: tuple[Tensor, Tensor]) -> int:
+    return sum(values.numel() * values.element_size() for values in pair)
+
+
 def drawn_views(
-    captures: Sequence[tuple[str, TrainingCapture]], views: int, config: CaptureConfig, *, generator: torch.Generator
+    captures: Sequence[tuple[str, TrainingCapture]],
+    views: int,
+    config: CaptureConfig,
+    *,
+    generator: torch.Generator,
+    pictures: ScaledPictures | None = None,
 ) -> CaptureViews:
     """One sequence: a capture, frames at a drawn stride in random order, and the places of their crops, as in
-    training.
+    training. ``pictures`` is for callers that draw several.
     """
     name, capture = captures[int(torch.randint(len(captures), (), generator=generator))]
     stride = config.strides[int(torch.randint(len(config.strides), (), generator=generator))]
@@ -131,10 +164,11 @@ def drawn_views(
     windows = [
         Window.of(capture.frames[frame], place.tolist(), config) for frame, place in zip(chosen, places, strict=True)
     ]
-    pictures = [window.read() for window in windows]
+    read = (pictures or ScaledPictures()).read
+    crops = [read(window) for window in windows]
     return CaptureViews(
-        images=torch.stack([image for image, _ in pictures]),
+        images=torch.stack([image for image, _ in crops]),
         cameras=capture.normalized(Pinholes.cat([window.camera for window in windows])).to(torch.float32),
-        truth=torch.stack([truth for _, truth in pictures]),
+        truth=torch.stack([truth for _, truth in crops]),
         capture=name,
     )

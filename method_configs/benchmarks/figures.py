@@ -9,6 +9,7 @@ from typing import Any
 from fb_core.files.ownership import signature
 from fb_core.files.whole import whole_file
 
+_LETTERS_PER_INCH = 27  # of the smallest print
 _logger = logging.getLogger(__name__)
 
 
@@ -25,10 +26,15 @@ def new_axes(label: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, whole or not at all, and say so."""
+def save_figure(figure: Any, path: Path, origin: str = "") -> None:
+    """Write a figure, whole or not at all, and say so; ``origin`` stands small above it."""
+    import textwrap
+
     from matplotlib import pyplot
 
+    if origin:
+        lines = textwrap.wrap(origin, int(_LETTERS_PER_INCH * figure.get_figwidth()))
+        figure.suptitle("\n".join(lines), fontsize=5, color="gray", parse_math=False)
     with whole_file(path) as unfinished:
         figure.savefig(unfinished, dpi=150, metadata=signature(path))
     pyplot.close(figure)

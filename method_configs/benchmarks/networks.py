@@ -260,13 +260,16 @@ def _saving_rows(cell: _Cell, runs: int) -> list[dict[str, Any]]:
     return rows
 
 
-def step_flops(config: DiTConfig, tokens: int, branch_count: int, words: int = WORDS) -> int:
-    """Floating point operations of the matrix products in one prepared step (two per multiplication and addition)."""
+def step_flops(config: DiTConfig, tokens: int, branch_count: int, words: int = WORDS, *, apart: int = 0) -> int:
+    """Floating point operations of the matrix products in one prepared step (two per multiplication and addition).
+
+    ``apart`` of the tokens are known and stand apart: no step computes them, but all others look at them.
+    """
     width, patch = config.width, config.patch**2
     linear = width * width * (4 + 3 * config.mlp_ratio) + 2 * tokens * width
     if config.text_width:
         linear += 2 * width * width + 2 * words * width
-    per_branch = tokens * (config.depth * linear + width * patch * config.out_channels)
+    per_branch = (tokens - apart) * (config.depth * linear + width * patch * config.out_channels)
     return 2 * (branch_count * per_branch + tokens * width * patch * config.out_channels)
 
 

@@ -5,6 +5,7 @@ command goes on.
 from __future__ import annotations
 
 import csv as csv_format
+import hashlib
 import io
 import json as json_format
 import logging
@@ -59,13 +60,16 @@ class TableFiles:
         """What was measured before under this name for the same question, or is measured now and kept.
 
         Args:
-            name: of the file, without its suffix.
+            name: of the file, without its suffix; a digest of the question follows, so that one folder may keep the
+                answers to several.
             asked: all that decides the result, in what JSON can hold.
             measure: gives what JSON can hold.
         """
         if self.keep is None:
             return measure()
-        question, path = json_format.loads(json_format.dumps(asked)), self.keep / f"{name}.json"
+        question = json_format.loads(json_format.dumps(asked))
+        digest = hashlib.sha256(json_format.dumps(question, sort_keys=True).encode()).hexdigest()[:8]
+        path = self.keep / f"{name}-{digest}.json"
         if path.is_file():
             from fb_core.files.json_files import read_json
 
@@ -104,8 +108,6 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def markdown_text(report: Report, command: str) -> str:
     """One table for each part, and below them what is needed to make them again."""
-    from fb_core.evaluation.results import commit, hardware
-
     lines = []
     for part in dict.fromkeys(row["part"] for row in report.rows):
         rows = [row for row in report.rows if row["part"] == part]
@@ -113,8 +115,18 @@ def markdown_text(report: Report, command: str) -> str:
         lines += [f"**{part}**", "", _line(name.replace("_", " ") for name in columns), _line("---" for _ in columns)]
         lines += [_line(_told(row.get(name)) for name in columns) for row in rows]
         lines.append("")
-    lines.append(f"`{command}`, commit {commit()}, seed {report.seed}, {hardware()}")
+    lines.append(origin_of(report, f"`{command}`"))
     return "\n".join(lines) + "\n"
+
+
+def origin_of(report: Report, command: str = "") -> str:
+    """What a table or a figure needs to be made again; by default with this process's command."""
+    from fb_core.evaluation.results import commit, hardware
+    from method_configs.benchmarks.command import command_line
+
+    models = sorted({row["model"] for row in report.rows if row.get("model", "-") != "-"})
+    told = f"model {', '.join(models)}, " if models else ""
+    return f"{command or command_line()}, {told}commit {commit()}, seed {report.seed}, {hardware()}"
 
 
 def _line(cells: Any) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from fb_core.evaluation.capture_questions import CaptureViews
@@ -89,14 +89,18 @@ class Conditioning(TableFiles):
         import torch
 
         from fb_core.data.training.capture_sequences import CaptureConfig
-        from fb_core.evaluation.capture_questions import capture_folders, drawn_views, readable_captures
+        from fb_core.evaluation.capture_questions import (
+            ScaledPictures,
+            capture_folders,
+            drawn_views,
+            readable_captures,
+        )
 
         views = self.hidden + max(self.known)
         captures = readable_captures(capture_folders(self.data), views=views)
         draws = (torch.Generator().manual_seed(self.seed * 1_000_003 + number) for number in range(self.sequences))
-        return [
-            drawn_views(captures, views, CaptureConfig(image_size=size, centered=1.0), generator=draw) for draw in draws
-        ]
+        config, pictures = CaptureConfig(image_size=size, centered=1.0), ScaledPictures()
+        return [drawn_views(captures, views, config, generator=draw, pictures=pictures) for draw in draws]
 
     def _scores(
         self, model: Fillerbuster, views: CaptureViews, known: int, number: int, sampling: SamplingConfig
@@ -137,4 +141,4 @@ def draw(report: Report, path: Path) -> None:
     axes.set_xscale("log", base=2)
     axes.set_xticks(known, [str(count) for count in known])
     axes.set_xlabel("known views")
-    save_figure(figure, path)
+    save_figure(figure, path, origin_of(report))

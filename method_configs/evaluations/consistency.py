@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from fb_core.evaluation.metrics.correspondences import Matcher
     from fb_core.evaluation.metrics.relative_rotation import PairResult
+    from fb_core.evaluation.results import Report
     from fb_core.geometry.cameras import Pinholes
     from method_configs.evaluations.true_films import Film
 
@@ -64,9 +65,10 @@ class Consistency(TableFiles):
         matcher = sift_matches if self.loftr is None else loftr_matcher(self.loftr)
         report = Report(seed=self.seed)
         judged: dict[tuple[str, str], list[PairResult]] = {}
+        poses: dict[str, str] = {}
         part = f"RRA: {self.pairs} pairs within a second of {self.fps:g} frames, {self._matcher}, {self.size} pixels"
         for run in self.runs:
-            found = self._judged(run, matcher, {capture for _, capture in judged})
+            found = self._judged(run, matcher, poses)
             for method, pairs in found["pairs"].items():
                 key = (method, found["capture"])
                 if key not in judged:  # of two runs of one method on one capture the first is told
@@ -75,8 +77,8 @@ class Consistency(TableFiles):
                     report.rows.append(
                         {"part": part, "method": method, "capture": key[1], "model": model} | accuracy(judged[key])
                     )
-        report.rows.extend(means(report.rows))
-        self.publish(report, lambda _, figure: draw(judged, figure, self._matcher))
+        report.rows.extend(means(report.rows, poses))
+        self.publish(report, lambda report, figure: draw(report, judged, figure, self._matcher))
 
     @property
     def _matcher(self) -> str:
@@ -97,20 +99,24 @@ class Consistency(TableFiles):
         if self.fov is not None:
             require_between("fov", self.fov, 1, 179)
 
-    def _judged(self, run: Path, matcher: Matcher, told: set[str]) -> dict[str, Any]:
+    def _judged(self, run: Path, matcher: Matcher, poses: dict[str, str]) -> dict[str, Any]:
         """``pairs`` of each film as plain values, the run's ``method``, its ``capture``'s name, its ``model``'s hash.
 
         Args:
             run: its folder.
             matcher: finds correspondences.
-            told: captures whose true film an earlier run of this command has brought.
+            poses: digest of the poses of each capture that an earlier run of this command was trained on, whose true
+                film is there already; this run's is added.
         """
         from fb_nerfstudio.runs.finished_run import capture_of, identity_of, read_run
 
         config, state = read_run(run)
         capture, method = capture_of(config), config.method_name
-        name = scene_name(capture)
-        with_truth = self.true_film and name not in told
+        name, digest = scene_name(capture), poses_digest(capture)
+        if poses.get(name, digest) != digest:  # another capture in a folder of the same name
+            name = f"{name} {digest}"
+        with_truth = self.true_film and digest not in poses.values()
+        poses[name] = digest
         options = ("seed", "path", "seconds", "fps", "pairs", "size", "fov", "controls")
         asked = (
             {option: getattr(self, option) for option in options}
@@ -181,6 +187,20 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
+def poses_digest(capture: Path) -> str:
+    """The same for copies of a capture, whose photos may be masked or scaled: they show one scene from the same
+    places. Of one that is gone, its folder's.
+    """
+    from fb_core.data.capture.captures import read_capture
+
+    try:
+        frames = read_capture(capture).frames
+    except (ValueError, OSError):
+        return _digest(str(capture.absolute()))
+    poses = sorted(frame.camera.camera_to_world.flatten().tolist() for frame in frames)
+    return _digest("\n".join(" ".join(f"{number + 0.0:.6g}" for number in pose) for pose in poses))
+
+
 def captured_cameras(pipeline: Any) -> list[Pinholes]:
     """Of the pictures that the run was trained on, in its world."""
     from fb_nerfstudio.bridge import to_pinhole_list
@@ -207,26 +227,30 @@ def dtype_of(pipeline: Any) -> Any:
     return pipeline.datamanager.train_dataset.cameras.camera_to_worlds.dtype
 
 
-def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def means(rows: Sequence[dict[str, Any]], poses: Mapping[str, str]) -> list[dict[str, Any]]:
     """Of each method that has several captures: the mean over these, and half the 95 % interval of the share within 5
-    degrees.
+    degrees. Captures of the same ``poses`` (by name) are copies of one, and together count once.
     """
     from fb_core.evaluation.ablations import interval
 
     result = []
     for method in dict.fromkeys(row["method"] for row in rows):
-        mine = [row for row in rows if row["method"] == method]
-        if len(mine) > 1:
-            mean: dict[str, Any] = {"part": "RRA, mean over captures", "method": method, "captures": len(mine)}
+        copies: dict[str, list[dict[str, Any]]] = {}
+        for row in rows:
+            if row["method"] == method:
+                copies.setdefault(poses[row["capture"]], []).append(row)
+        if len(copies) > 1:
+            mean: dict[str, Any] = {"part": "RRA, mean over captures", "method": method, "captures": len(copies)}
             for name in ("rra_1", "rra_2", "rra_5", "rra_10", "rra_20", "maa_10", "median_degrees", "failed"):
-                mean[name], half = interval([float(row[name]) for row in mine])
+                each = [sum(float(row[name]) for row in same) / len(same) for same in copies.values()]
+                mean[name], half = interval(each)
                 if name == "rra_5":
                     mean["rra_5_interval"] = half
             result.append(mean)
     return result
 
 
-def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: str) -> None:
+def draw(report: Report, judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: str) -> None:
     """The share of pairs below each threshold, one curve for each method over all its captures."""
     import numpy as np
 
@@ -241,4 +265,4 @@ def draw(judged: dict[tuple[str, str], list[PairResult]], path: Path, matcher: s
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(f"error of the relative rotation in degrees ({matcher})")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
-    save_figure(figure, path)
+    save_figure(figure, path, origin_of(report))

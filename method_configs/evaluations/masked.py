@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from fb_core.files.limits import MOST_TRAINING_STEPS, require_between
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 from method_configs.evaluations.consistency import scene_name
 
 if TYPE_CHECKING:
@@ -272,4 +272,4 @@ def draw(report: Report, path: Path) -> None:
     labels = [f"{row['method']}\n{row['capture']}\n{row['normals']} normals" for row in rows]
     axes.bar(range(len(rows)), [row["psnr"] for row in rows], yerr=[row["psnr_interval"] for row in rows], capsize=4)
     axes.set_xticks(range(len(rows)), labels)
-    save_figure(figure, path)
+    save_figure(figure, path, origin_of(report))

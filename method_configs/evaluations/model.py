@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from fb_core.files.limits import MOST_SIDE, MOST_VIEWS, require_between
 from fb_core.machine.devices import chosen_device
-from method_configs.benchmarks.table_files import TableFiles
+from method_configs.benchmarks.table_files import TableFiles, origin_of
 
 if TYPE_CHECKING:
     from fb_core.evaluation.ablations import Asked
@@ -112,7 +112,12 @@ class ModelOnCaptures(TableFiles):
 
         from fb_core.data.training.capture_sequences import CaptureConfig
         from fb_core.evaluation.ablations import Asked
-        from fb_core.evaluation.capture_questions import capture_folders, drawn_views, readable_captures
+        from fb_core.evaluation.capture_questions import (
+            ScaledPictures,
+            capture_folders,
+            drawn_views,
+            readable_captures,
+        )
         from fb_core.evaluation.completion import unseen_room
         from fb_core.masks import training_mixture
 
@@ -121,6 +126,8 @@ class ModelOnCaptures(TableFiles):
             {} if folders is None else {length: readable_captures(folders, views=length) for length in self.lengths}
         )
 
+        config, pictures = CaptureConfig(image_size=size), ScaledPictures()
+
         @cache
         def question(length: int, number: int) -> Asked:
             draw = torch.Generator().manual_seed(self.seed * _OTHER_MASKS + number)
@@ -128,7 +135,7 @@ class ModelOnCaptures(TableFiles):
                 room = unseen_room(family=self.family, seed=self.seed, number=number, views=length, size=size)
                 known = training_mixture(length, size, size, generator=draw, in_order=True)
             else:
-                room = drawn_views(captures[length], length, CaptureConfig(image_size=size), generator=draw)
+                room = drawn_views(captures[length], length, config, generator=draw, pictures=pictures)
                 known = training_mixture(length, size, size, generator=draw, in_order=True) * room.truth
             return Asked(room, known, self.seed + number)
 
@@ -210,4 +217,4 @@ def draw(report: Report, path: Path) -> None:
         axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend()
-    save_figure(figure, path)
+    save_figure(figure, path, origin_of(report))

@@ -9,7 +9,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from fb_core.evaluation.results import Bar, Report, hardware, median_seconds, relative_difference
-from fb_core.networks.transformer.dit import DiTConfig
+from fb_core.networks.transformer.dit import DiTConfig, TokenFacts
 from fb_core.networks.transformer.prepared import Prepared
 from method_configs.benchmarks import networks as benchmark_networks
 from method_configs.benchmarks import precision as benchmark_precision
@@ -62,6 +62,20 @@ def test_floating_point_operations_are_those_that_torch_counts(text_width):
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         prepared(torch.randn(3, 32, 4, 6), 1.0)
     assert step_flops(transformer, 3 * 2 * 3, 2) == counter.get_total_flops()
+
+
+@torch.no_grad()
+def test_known_tokens_that_stand_apart_cost_no_step_but_to_be_looked_at():
+    transformer = DiTConfig(heads=2, head_dim=8, depth=2, text_width=0, known_tokens="apart")
+    dit = random_model(dataclasses.replace(SMALL, transformer=transformer), 0).dit
+    known = torch.zeros(1, 3, 2, 3, dtype=torch.bool)
+    known[:, 0] = True
+    prepared = Prepared(dit, torch.randn(1, 3, 34, 4, 6), [1.0], facts=TokenFacts(known=known))
+    state = torch.randn(3, 32, 4, 6)
+    prepared(state, 1.0)  # what is known is computed at first use
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        prepared(state, 1.0)
+    assert step_flops(transformer, 3 * 2 * 3, 1, apart=2 * 3) == counter.get_total_flops()
 
 
 def test_networks_in_miniature(tmp_path, monkeypatch, capsys):

@@ -11,13 +11,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers.tiny_models import save_tiny_model, tiny_model
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
 from fb_core import checkpoint
 from fb_core.inpainter import Fillerbuster
 from fb_core.networks.transformer.dit import DiT, DiTConfig
 from fb_core.networks.vae import IMAGE_VAE, RAYMAP_VAE
 from method_configs.benchmarks import inference as inference_benchmark
-from method_configs.benchmarks.inference import Inference, reckoned_seconds
+from method_configs.benchmarks.inference import Cell, Inference, reckoned_seconds
 
 
 def test_times_are_reckoned_along_a_line():
@@ -43,7 +45,7 @@ def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
     few = [(views, 32, steps) for views in (1, 4) for steps in (1, 4, 12)]
     assert asked == few, "on CPUs few steps are measured, and one before them sets up what is needed"
     assert [(row["views"], row["steps"], row["how"]) for row in rows] == [
-        (views, steps, "reckoned") for views in (1, 4) for steps in (50, 1)
+        (views, steps, "reckoned from 4 and 12 steps") for views in (1, 4) for steps in (50, 1)
     ]
     assert all(row["seconds"] > 0 and row["paper_a100_seconds"] is None for row in rows)
     assert all(path.stat().st_size > 100 for path in files.values())
@@ -54,22 +56,78 @@ def test_every_cell_is_measured_once_and_told(tmp_path: Path, monkeypatch):
 
 
 def test_the_released_architecture_is_reckoned_from_one_step_without_weights(tmp_path: Path, monkeypatch):
-    """Its sizes are the released ones; here they are shrunk, but for the measure."""
+    """Its sizes are the released ones; here they are shrunk, but for the measure, and so is what counts as long."""
     with torch.device("meta"):
         assert sum(weight.numel() for weight in DiT(DiTConfig()).parameters()) > 600e6
     small = save_tiny_model(tmp_path / "model")
+    monkeypatch.setattr(inference_benchmark, "_LONG", 0)
     monkeypatch.setattr(
         inference_benchmark, "untrained", lambda sizes, seed, device: Fillerbuster(checkpoint.load(small))
     )
     shared = {"released_architecture": True, "views": (2,), "sizes": (32,), "device": "cpu"}
     Inference(**shared, keep=tmp_path / "kept", json=tmp_path / "table.json").run()
     rows = json.loads((tmp_path / "table.json").read_text())["rows"]
-    assert [(row["steps"], row["how"]) for row in rows] == [(50, "reckoned"), (24, "reckoned")]
-    kept = json.loads((tmp_path / "kept" / "random-weights" / "32-2.json").read_text())["measured"]
+    assert [(row["steps"], row["how"]) for row in rows] == [
+        (steps, "reckoned from 1 and 2 steps") for steps in (50, 24)
+    ]
+    (file,) = (tmp_path / "kept" / "random-weights").glob("32-2-*.json")
+    kept = json.loads(file.read_text())["measured"]
     assert list(kept) == ["1", "2"] and "random weights" in rows[0]["part"]
     assert rows[0]["seconds"] == pytest.approx(kept["1"] + 49 * max(0, kept["2"] - kept["1"]))
     with pytest.raises(ValueError, match="expected --model or --released-architecture, got both"):
         Inference(**shared, model=small).run()
+
+
+def test_what_no_step_can_be_waited_for_is_reckoned_by_operations(tmp_path: Path, monkeypatch):
+    """Where seconds are proportional to operations, the reckoned ones are those that a measurement would give."""
+    small = save_tiny_model(tmp_path / "model")
+    model, asked = Fillerbuster(checkpoint.load(small)), []
+    cells = {(views, size): Cell.of(model, size, views) for size in (32, 64) for views in (2, 4)}
+    steps = {where: cell.step for where, cell in cells.items()}
+
+    def of_this_machine(model, views, size, steps, seed, clock):
+        asked.append((views, size, steps))
+        cell = Cell.of(model, size, views)
+        return 1e-6 * cell.once + 2e-6 * steps * cell.step
+
+    monkeypatch.setattr(inference_benchmark, "timed", of_this_machine)
+    monkeypatch.setattr(inference_benchmark, "_LONG", steps[2, 32])
+    monkeypatch.setattr(inference_benchmark, "_TOO_LONG", steps[4, 32])
+    table, figure = tmp_path / "table.json", tmp_path / "table.png"
+    shared = {"model": small, "views": (2, 4), "sizes": (32, 64), "device": "cpu"}
+    Inference(**shared, json=table, figure=figure).run()
+    rows = json.loads(table.read_text())["rows"]
+    assert set(asked) == {(2, 32, 1), (2, 32, 4), (2, 32, 12), (1, 32, 1), (4, 32, 1), (4, 32, 2)}
+    by_operations = "reckoned by operations from 4 views of 32 pixels, 1 and 2 steps"
+    assert {(row["views"], row["size"]): row["how"] for row in rows} == {
+        (2, 32): "reckoned from 4 and 12 steps",
+        (4, 32): "reckoned from 1 and 2 steps",
+        (2, 64): by_operations,
+        (4, 64): by_operations,
+    }
+    for row in rows:
+        cell = cells[row["views"], row["size"]]
+        assert row["seconds"] == pytest.approx(1e-6 * cell.once + 2e-6 * row["steps"] * cell.step, rel=1e-6)
+        assert row["tera_operations"] == pytest.approx(1e-12 * (cell.once + row["steps"] * cell.step))
+    monkeypatch.setattr(inference_benchmark, "_TOO_LONG", 0)
+    asked.clear()
+    Inference(**shared).run()
+    assert {where[:2] for where in asked} == {(2, 32)}, "the smallest is measured, whatever it takes"
+
+
+@pytest.mark.parametrize("weights", ["tiny", "bundled"])
+def test_operations_are_those_that_torch_counts(weights, tmp_path: Path):
+    """Of a whole sampling: two steps more are two steps; what comes once is right within a few percent."""
+    model = tiny_model(tmp_path) if weights == "tiny" else Fillerbuster.from_pretrained(None)
+    counts = {}
+    inference_benchmark.timed(model, 4, 64, 1, 0)
+    for steps in (2, 4):
+        with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+            inference_benchmark.timed(model, 4, 64, steps, 0)
+        counts[steps] = counter.get_total_flops()
+    cell = Cell.of(model, 64, 4)
+    assert (counts[4] - counts[2]) / 2 == pytest.approx(cell.step, rel=0.05)
+    assert counts[2] - 2 * cell.step == pytest.approx(cell.once, rel=0.1)
 
 
 def test_random_weights_of_a_model_that_reads_text_complete_views():

@@ -174,7 +174,7 @@ def test_hash_stands_for_architecture_and_weights(tmp_path, folder, networks):
 
 
 def test_no_such_folder(tmp_path):
-    with pytest.raises(ValueError, match=r"there is no folder .*nowhere"):
+    with pytest.raises(ValueError, match=r"there is no folder .*nowhere; fillerbuster convert makes one"):
         load(tmp_path / "nowhere")
 
 

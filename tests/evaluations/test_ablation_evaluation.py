@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers.tiny_models import save_tiny_model, tiny_model
 
+from fb_core.conditioning import encode_known, join, stacked_facts, unsplit
 from fb_core.evaluation.ablations import (
     AblationTask,
     asked_sequences,
@@ -17,7 +18,8 @@ from fb_core.evaluation.ablations import (
     interval,
 )
 from fb_core.evaluation.completion import unseen_room
-from fb_core.inpainter import SamplingConfig
+from fb_core.geometry.raymap import CanonicalFrame, raymaps_of, to_unit_range
+from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.masks import training_mixture
 from fb_core.training import side_by_side
 from method_configs.evaluations import ablations as ablation_evaluation
@@ -47,6 +49,28 @@ def test_a_network_that_answers_nothing_has_the_velocity_s_own_size_as_validatio
     latents = model.image_vae.encode(room.images)
     loss = conditional_validation_loss(model, room, masks, times=2)
     assert loss == pytest.approx(1 + float(latents.square().mean()), rel=0.15)
+
+
+@pytest.mark.parametrize("weights", ["joint", "apart"])
+@torch.no_grad()
+def test_validation_loss_is_that_of_the_network_at_every_time(weights, tmp_path):
+    """The twin asks the network itself at each time, and keeps nothing between them."""
+    model = tiny_model(tmp_path) if weights == "joint" else Fillerbuster.from_pretrained(None)
+    assert model.config.transformer.known_tokens == weights
+    room = unseen_room(family="narrow", seed=0, number=0, views=4, size=model.size)
+    known = training_mixture(4, model.size, model.size, generator=torch.Generator().manual_seed(0), in_order=True)
+    rays = to_unit_range(CanonicalFrame.of(room.cameras).apply(raymaps_of(room.cameras)))
+    vaes = {"image_vae": model.image_vae, "raymap_vae": model.raymap_vae}
+    told = encode_known(room.images, known, rays, torch.ones_like(known), **vaes, transformer=model.dit.config)
+    data = unsplit(model.image_vae.encode(room.images), model.raymap_vae.encode(rays))
+    noise = torch.randn(data[None].shape, generator=torch.Generator().manual_seed(5))[0]
+    errors = []
+    for time in (1.0, 0.75, 0.5, 0.25):
+        state = join((1 - time) * data + time * noise, told)[None]
+        velocity = model.dit(state, torch.tensor([time]), None, None, stacked_facts([told], model.dit.config))[0]
+        errors.append(float((velocity - (noise - data))[:, :16].square().mean()))
+    loss = conditional_validation_loss(model, room, known, times=4, seed=5)
+    assert loss == pytest.approx(sum(errors) / 4, rel=1e-4)
 
 
 def test_known_views_are_not_scored_and_rows_are_reproducible(tmp_path):

@@ -15,10 +15,16 @@ from helpers.folders.colmap_files import colmap_capture
 from helpers.tiny_models import save_tiny_model, tiny_model
 
 from fb_core.data.capture.captures import read_capture
-from fb_core.data.training.capture_sequences import CaptureConfig
+from fb_core.data.training.capture_sequences import CaptureConfig, Window
 from fb_core.evaluation import ablations, conditioning
 from fb_core.evaluation.ablations import Asked, conditional_validation_loss, sequence_scores
-from fb_core.evaluation.capture_questions import CaptureViews, capture_folders, drawn_views, readable_captures
+from fb_core.evaluation.capture_questions import (
+    CaptureViews,
+    ScaledPictures,
+    capture_folders,
+    drawn_views,
+    readable_captures,
+)
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from method_configs.evaluations.conditioning import Conditioning
 from method_configs.evaluations.model import PAPER, ModelOnCaptures
@@ -38,6 +44,28 @@ def test_questions_are_decided_by_their_seed(tiny_capture: Path):
     assert one.images.shape == (4, 3, 32, 32) and one.capture == "tiny_capture"
     assert 0 < float(one.truth.mean()) < 1, "every second picture has a mask"
     assert float((one.images * (1 - one.truth)).abs().max()) == 0
+
+
+def test_pictures_that_sequences_share_are_read_once_while_there_is_room(tiny_capture: Path, monkeypatch):
+    captures, config, read = readable_captures([tiny_capture], views=4), CaptureConfig(image_size=32), []
+    real = Window.scaled
+    monkeypatch.setattr(Window, "scaled", lambda window: read.append(window.frame.image_path) or real(window))
+
+    def drawn(pictures: ScaledPictures | None) -> list[CaptureViews]:
+        read.clear()
+        draws = [torch.Generator().manual_seed(seed) for seed in range(6)]
+        return [drawn_views(captures, 4, config, generator=draw, pictures=pictures) for draw in draws]
+
+    alone = drawn(None)
+    assert len(read) == 24
+    for most_bytes in (2**30, 0):
+        together = drawn(ScaledPictures(most_bytes))
+        assert len(read) == (len(set(read)) if most_bytes else 24)
+        for one, other in zip(alone, together, strict=True):
+            assert torch.equal(one.images, other.images) and torch.equal(one.truth, other.truth)
+    pictures = ScaledPictures(2**16)
+    drawn(pictures)
+    assert 0 < sum(image.nbytes + truth.nbytes for image, truth in pictures._kept.values()) <= 2**16
 
 
 @pytest.mark.parametrize("layout", ["nerfstudio", "lerf", "scannetpp"])

@@ -227,8 +227,18 @@ class Window:
         return straight.scaled(self.width, self.height).cropped(self.left, self.top, self.size, self.size)
 
     def read(self) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
-        """(picture, truth); the picture is black where there is no truth."""
+        """(picture, truth) of the square; the picture is black where there is no truth."""
+        return self.cut_from(*self.scaled())
+
+    def scaled(self) -> tuple[Float[Tensor, "3 h2 w2"], Float[Tensor, "1 h2 w2"]]:
+        """(picture, truth) of the whole scaled picture."""
         image, mask, _ = self.frame.load_undistorted()
         image, mask = wholly_known(image, mask, lambda channels: media.resize(channels, self.height, self.width))
-        cut = (slice(None), slice(self.top, self.top + self.size), slice(self.left, self.left + self.size))
-        return image.clamp(0, 1)[cut], mask[cut]
+        return image.clamp(0, 1), mask
+
+    def cut_from(
+        self, image: Float[Tensor, "3 h2 w2"], truth: Float[Tensor, "1 h2 w2"]
+    ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "1 h w"]]:
+        """The square of what `scaled` gives."""
+        square = (slice(None), slice(self.top, self.top + self.size), slice(self.left, self.left + self.size))
+        return image[square], truth[square]

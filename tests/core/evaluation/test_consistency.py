@@ -26,14 +26,16 @@ from fb_core.evaluation.metrics.relative_rotation import (
     true_rotation,
     wilson_interval,
 )
-from fb_core.evaluation.results import Report
+from fb_core.evaluation.results import Report, commit, hardware
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.viewpoints.camera_paths import path_cameras
 from fb_nerfstudio.bridge import to_nerfstudio, to_pinholes
 from fb_nerfstudio.runs import finished_run
-from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text
-from method_configs.evaluations.consistency import Consistency
-from method_configs.evaluations.true_films import true_pictures
+from method_configs.benchmarks.command import command_line
+from method_configs.benchmarks.figures import new_axes, save_figure
+from method_configs.benchmarks.table_files import TableFiles, csv_text, markdown_text, origin_of
+from method_configs.evaluations.consistency import Consistency, poses_digest
+from method_configs.evaluations.true_films import TRUE_FILM, true_pictures
 
 FRAMES, FPS, SIZE, FOV = 120, 12, 160, 75.0
 
@@ -254,6 +256,46 @@ def test_a_procedural_room_is_also_judged_as_it_is(tmp_path: Path):
         assert float((pictures(number) - frame.load_image()).abs().mean()) < 0.01
 
 
+def test_a_masked_copy_is_no_further_capture(monkeypatch, tmp_path: Path):
+    """Runs on room 0, on a copy of it with a block cut out, and on room 1, which lies in a folder of the same name:
+    means are over two captures, of which the first weighs no more for its two runs; each room's true film comes once.
+    """
+    from fb_core.data.rooms.room_captures import rooms
+    from method_configs.benchmarks.methods import cut_blocks
+
+    places = {"plain": "a/room", "cut": "a/room-masked", "other": "b/room"}
+    captures = {name: tmp_path / place for name, place in places.items()}
+    for seed, name in ((0, "plain"), (1, "other")):
+        rooms(seed, captures[name], views=3, size=32, held_out=2)
+    cut_blocks(captures["plain"], captures["cut"], share=0.35)
+    assert poses_digest(captures["plain"]) == poses_digest(captures["cut"]) != poses_digest(captures["other"])
+    errors = {"plain": 1.5, "cut": 7.0, "other": 0.5}
+    brought = []
+
+    def config_of(run: Path):
+        manager = SimpleNamespace(data=captures[run.name])
+        return SimpleNamespace(method_name="m", pipeline=SimpleNamespace(datamanager=manager), data=None), {"step": 7}
+
+    def measured(self, run, method, capture, matcher, with_truth):
+        brought.extend([run.name] if with_truth else [])
+        pair = {"first": 0, "second": 1, "true_degrees": 9.0, "error_degrees": errors[run.name]}
+        pair |= {"matches": 9, "inliers": 9}
+        films = {method: [pair]} | ({TRUE_FILM: [pair | {"error_degrees": 0.1}]} if with_truth else {})
+        return {"pairs": films, "model": "-"}
+
+    monkeypatch.setattr(finished_run, "read_run", config_of)
+    monkeypatch.setattr(finished_run, "identity_of", lambda run, state: {"run": run.name})
+    monkeypatch.setattr(Consistency, "_measured", measured)
+    Consistency(runs=tuple(Path(name) for name in places), json=tmp_path / "table.json").run()
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    assert brought == ["plain", "other"]
+    assert len({row["capture"] for row in rows if row.get("method") == "m" and "capture" in row}) == 3
+    mean = {row["method"]: row for row in rows if "captures" in row}
+    assert {name: row["captures"] for name, row in mean.items()} == {"m": 2, TRUE_FILM: 2}
+    assert mean["m"]["rra_2"] == pytest.approx((0.5 + 1.0) / 2)
+    assert mean["m"]["median_degrees"] == pytest.approx(((1.5 + 7.0) / 2 + 0.5) / 2)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -282,8 +324,12 @@ def test_what_was_kept_answers_the_same_question_only(tmp_path: Path):
         return [len(asked)]
 
     assert [files.kept("cell", {"seed": seed}, measure) for seed in (0, 0, 1, 1)] == [[1], [1], [2], [2]]
-    (tmp_path / "kept" / "cell.json").write_text("{")
-    assert files.kept("cell", {"seed": 1}, measure) == [3]
+    assert files.kept("cell", {"seed": 0}, measure) == [1], "another question does not take its place"
+    kept = list((tmp_path / "kept").iterdir())
+    assert len(kept) == 2 and all(path.name.startswith("cell-") for path in kept)
+    for path in kept:
+        path.write_text("{")
+    assert files.kept("cell", {"seed": 1}, measure) == [3], "what cannot be read is measured again"
 
 
 def test_tables_as_text():
@@ -292,3 +338,13 @@ def test_tables_as_text():
     lines = markdown_text(Report(seed=5, rows=rows), "fillerbuster eval").splitlines()
     assert lines[2:6] == ["| name | value | more |", "| --- | --- | --- |", "| x\\|y | 0.123 | - |", "| z | - | 3 |"]
     assert "seed 5" in lines[-1] and "fillerbuster eval" in lines[-1]
+
+
+def test_a_figure_says_what_it_takes_to_make_it_again(tmp_path: Path):
+    rows = [{"part": "a", "model": hashed} for hashed in ("f9b4db88", "-", "0123abcd")]
+    figure, _ = new_axes("dB")
+    save_figure(figure, tmp_path / "figure.png", origin_of(Report(seed=5, rows=rows)))
+    told = figure.get_suptitle().replace("\n", " ")
+    assert told.startswith(command_line().split()[0]) and "model 0123abcd, f9b4db88," in told
+    assert f"commit {commit()}" in told and "seed 5" in told and hardware() in told
+    assert (tmp_path / "figure.png").stat().st_size > 1000
