@@ -26,8 +26,11 @@ _OF_JAXTYPING = jaxtyping.jaxtyped
 _NAMES_OF_AXES = _OF_JAXTYPING("context")
 """Inside, an axis has the same length wherever its name stands; entered anew for each call."""
 
-CHECKS: dict[types.CodeType, Callable] = {}
-"""For each function that was called, by its code: what takes the function and its arguments, and calls it, checked."""
+CHECKS: dict[int, tuple[types.CodeType, Callable]] = {}
+"""For each function within a function that was called: its code, which stays so that its ``id`` does, and its maker of
+checking functions. Codes are told apart by ``id``, since those of two dataclasses with fields of the same names are
+equal.
+"""
 
 
 def install(modules: Sequence[str]) -> None:
@@ -52,56 +55,73 @@ def _decorated(thing: Callable) -> Callable:
         return thing
     if any("{" in str(annotation) for annotation in thing.__annotations__.values()):
         return _OF_JAXTYPING(thing, typechecker=checked)  # a shape that is told by an argument: "{self.height}"
-    configuration, code = jaxtyping.config, thing.__code__
+    configuration = jaxtyping.config
+    call: Callable | None = None
 
     @functools.wraps(thing)
     def called(*arguments, **named):
+        nonlocal call
         __tracebackhide__ = True
         if configuration.jaxtyping_disable:
             return thing(*arguments, **named)
-        call = CHECKS.get(code)
-        if call is None:
-            call = CHECKS[code] = _checking_call(thing)
-        with _NAMES_OF_AXES:
-            return call(thing, arguments, named)
+        call = call or _checking(thing)
+        return call(*arguments, **named)
 
     return called
 
 
-def _checking_call(function: types.FunctionType) -> Callable:
-    """What calls a function of this code with its arguments checked, and checks the result."""
-    hints = {name: _resolved(given, function.__globals__) for name, given in function.__annotations__.items()}
+def _checking(function: types.FunctionType) -> Callable:
+    """The function with its arguments and its result checked."""
     if "<locals>" in function.__qualname__ or inspect.isgeneratorfunction(function):
-        return _call_by_signature(inspect.signature(function), hints)
+        code = function.__code__
+        if id(code) not in CHECKS:
+            CHECKS[id(code)] = code, _by_signature(inspect.signature(function), _hints(function))
+        return CHECKS[id(code)][1](function)
     twin = types.FunctionType(
         function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
     twin.__kwdefaults__ = function.__kwdefaults__
     twin.__qualname__, twin.__module__ = function.__qualname__, function.__module__
-    twin.__annotations__ = hints
-    checking = checked(twin)
-    return lambda function, arguments, named: checking(*arguments, **named)
+    twin.__annotations__ = _hints(function)
+    return _with_axes(checked(twin), twin.__annotations__)
 
 
-def _call_by_signature(signature: inspect.Signature, hints: dict[str, object]) -> Callable:
-    """The same for functions that come into being again and again, with other closures, and for generators."""
+def _with_axes(checking: Callable, hints: dict[str, object]) -> Callable:
+    """Names of axes hold within one call, if there are any."""
+    if "jaxtyping." not in repr(hints):
+        return checking
+
+    def call(*arguments, **named):
+        __tracebackhide__ = True
+        with _NAMES_OF_AXES:
+            return checking(*arguments, **named)
+
+    return call
+
+
+def _by_signature(signature: inspect.Signature, hints: dict[str, object]) -> Callable[[Callable], Callable]:
+    """The same for functions that come into being again and again, with other closures, and for generators: a maker of
+    checking functions.
+    """
     hints = {name: hint for name, hint in hints.items() if not _of_anything(hint)}
     of_result = hints.pop("return", typing.Any)
     kinds = {name: parameter.kind for name, parameter in signature.parameters.items()}
+    several = {inspect.Parameter.VAR_POSITIONAL: tuple, inspect.Parameter.VAR_KEYWORD: dict.values}
 
-    def call(function: Callable, arguments: tuple, named: dict[str, object]):
-        __tracebackhide__ = True
-        for name, value in signature.bind(*arguments, **named).arguments.items():
-            if name not in hints:
-                continue
-            several = {inspect.Parameter.VAR_POSITIONAL: tuple, inspect.Parameter.VAR_KEYWORD: dict.values}
-            for one in several[kinds[name]](value) if kinds[name] in several else (value,):
-                _check(one, hints[name], function, f"argument {name}")
-        result = function(*arguments, **named)
-        _check(result, of_result, function, "result")
-        return result
+    def made(function: Callable) -> Callable:
+        def call(*arguments, **named):
+            __tracebackhide__ = True
+            for name, value in signature.bind(*arguments, **named).arguments.items():
+                if name in hints:
+                    for one in several[kinds[name]](value) if kinds[name] in several else (value,):
+                        _check(one, hints[name], function, f"argument {name}")
+            result = function(*arguments, **named)
+            _check(result, of_result, function, "result")
+            return result
 
-    return call
+        return _with_axes(call, hints | {"return": of_result})
+
+    return made
 
 
 def _check(value: object, hint: object, function: Callable, which: str) -> None:
@@ -109,9 +129,12 @@ def _check(value: object, hint: object, function: Callable, which: str) -> None:
         die_if_unbearable(value, hint, conf=_RULES, exception_prefix=f"{function.__qualname__}: {which} ")
 
 
-def _resolved(annotation: object, names: dict[str, object]) -> object:
-    """The type that an annotation stands for; anything where it names what only a type checker imports."""
+def _hints(function: types.FunctionType) -> dict[str, object]:
+    """The types of arguments and result; anything where an annotation names what only a type checker imports."""
+    return {name: _resolved(given, function.__globals__) for name, given in function.__annotations__.items()}
 
+
+def _resolved(annotation: object, names: dict[str, object]) -> object:
     def holder(value: annotation):  # type: ignore[valid-type]
         del value
 

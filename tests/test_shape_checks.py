@@ -137,6 +137,14 @@ def test_an_int_passes_for_a_float_and_a_string_does_not() -> None:
         inside("2")
 
 
+def test_classes_with_fields_of_the_same_names_have_their_own_types() -> None:
+    """The code of their ``__init__`` is the same."""
+    named = like_the_hook(dataclasses.make_dataclass("Named", [("a", str), ("b", str)], kw_only=True, frozen=True))
+    assert named(a="x", b="y").b == "y" and Pair(a=WIDE, b=WIDE).b is WIDE
+    with pytest.raises(jaxtyping.TypeCheckError):
+        Pair(a="x", b="y")
+
+
 def test_a_function_within_a_function_is_looked_into_once() -> None:
     inner()(WIDE)
     before = len(shape_checks.CHECKS)
