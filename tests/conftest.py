@@ -12,6 +12,7 @@ from pathlib import Path
 import jaxtyping
 import numpy as np
 import pytest
+import shape_checks
 import torch
 from hypothesis import settings
 
@@ -19,9 +20,7 @@ from hypothesis import settings
 # the rasterizer run thousands of times for each picture, so their shapes are tested where they meet, not at each call.
 _CORE = Path(__file__).resolve().parents[1] / "fb_core"
 _CHECKED = sorted(path.stem for path in _CORE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists())
-jaxtyping.install_import_hook(
-    [f"fb_core.{name}" for name in _CHECKED if name not in ("__init__", "splatting")], "shape_checks.checked"
-)
+shape_checks.install([f"fb_core.{name}" for name in _CHECKED if name not in ("__init__", "splatting")])
 
 torch.set_num_threads(min(2, torch.get_num_threads()))
 settings.register_profile("fillerbuster", deadline=None, derandomize=True, max_examples=25)

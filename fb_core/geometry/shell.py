@@ -112,17 +112,34 @@ def fit_shell(
     log_distance = distance.log()
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))
     log_distance = log_distance.clamp(bounds[0], bounds[1])
-    # 1 - cos(angle) is half the squared angle for small angles.
     directions = _table_directions(center)
-    half_square = (directions @ (offset / distance[:, None]).T).clamp(max=1.0).neg_().add_(1.0)
-    weight = half_square.add_(math.radians(bandwidth_degrees) ** 2 / 2).pow_(-_POWER)
-    table = (weight @ log_distance) / weight.sum(dim=1)
+    table = torch.cat(
+        [
+            _near_by(part, offset / distance[:, None], log_distance, bandwidth_degrees)
+            for part in directions.split(_COLUMNS)
+        ]
+    )
     if up is not None:
         for axis in (up, -up):
             table = torch.minimum(
                 table, _log_distance_to_plane(offset @ axis, float(distance.median()), directions @ axis)
             )
     return Shell(center=center, log_radius=table.reshape(_ROWS, _COLUMNS))
+
+
+def _near_by(
+    directions: Float[Tensor, "m 3"],
+    points: Float[Tensor, "n 3"],
+    values: Float[Tensor, "n"],
+    bandwidth_degrees: float,
+) -> Float[Tensor, "m"]:
+    """Mean of the values of points (unit directions) about each direction, weighted by inverse angles. Asked for few
+    directions at a time, whose weights stay in the processor's cache.
+    """
+    # 1 - cos(angle) is half the squared angle for small angles.
+    half_square = (directions @ points.T).clamp(max=1.0).neg_().add_(1.0)
+    weight = half_square.add_(math.radians(bandwidth_degrees) ** 2 / 2).pow_(-_POWER)
+    return (weight @ values) / weight.sum(dim=1)
 
 
 def intersect(

@@ -99,25 +99,28 @@ def _upwards(mount: Path, inside: str, path: str) -> Iterator[Path]:
 
 
 def _rooms(group: Path) -> Iterator[int]:
-    """Bytes that a group's limits leave; nothing where it has none."""
+    """Bytes that a group's limits leave; nothing where it has none. Asked for each picture that is opened, so that no
+    file is read twice or in vain.
+    """
     for current, limits, idle in (
         ("memory.current", ("memory.max", "memory.high"), "inactive_file"),
         ("memory.usage_in_bytes", ("memory.limit_in_bytes",), "total_inactive_file"),
     ):
         used = _number(group / current)
-        above = _stat(
-            group, "hierarchical_memory_limit", _UNLIMITED
-        )  # version 1: the least of all around it, seen by the mount or not
+        if used is None:
+            continue
+        statistics = _statistics(group)
+        above = statistics.get("hierarchical_memory_limit")  # version 1: the least around it, seen by the mount or not
         for limit in (above, *map(_number, (group / name for name in limits))):
-            if used is not None and limit is not None and limit < _UNLIMITED:
-                yield limit - max(0, used - _stat(group, idle))
+            if limit is not None and limit < _UNLIMITED:
+                yield limit - max(0, used - statistics.get(idle, 0))
 
 
-def _stat(group: Path, name: str, without: int = 0) -> int:
-    """A value of the group's statistics; `without` where they do not have it."""
+def _statistics(group: Path) -> dict[str, int]:
+    """The group's statistics by their names."""
     lines = (line.split() for line in _text(group / "memory.stat").splitlines())
-    found = next((_whole(words[1]) for words in lines if len(words) == 2 and words[0] == name), None)
-    return without if found is None else found
+    pairs = ((words[0], _whole(words[1])) for words in lines if len(words) == 2)
+    return {name: value for name, value in pairs if value is not None}
 
 
 def _number(path: Path) -> int | None:

@@ -21,6 +21,7 @@ import torch
 from helpers.folders.runs import generated_views, make_run
 from helpers.processes.ns_train import run_ns_train, toy_config
 from helpers.tiny_models import save_tiny_model
+from helpers.tiny_training import TOY
 from safetensors.torch import save_file
 
 from fb_core.completion.results.cache import CompletionCache
@@ -35,6 +36,7 @@ from fb_core.training.run.progress_log import ProgressLog
 from fb_nerfstudio.runs.training_process import TrainingProcess
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs.commands import command_line as commands
+from method_configs.presets import PRESETS
 from method_configs.splats import fillerbuster
 
 KIB, BLOCK = 1024, 4096
@@ -203,7 +205,10 @@ def refusal(capsys: pytest.CaptureFixture, *arguments: object) -> str:
 
 
 @pytest.mark.parametrize("state", ["full", "read-only"])
-def test_commands_on_such_a_disk(disk: Disk, shared_path, tmp_path: Path, tiny_capture: Path, capsys, state: str):
+def test_commands_on_such_a_disk(
+    disk: Disk, shared_path, tmp_path: Path, tiny_capture: Path, capsys, monkeypatch: pytest.MonkeyPatch, state: str
+):
+    monkeypatch.setitem(PRESETS, "toy", TOY)
     run = make_run(tmp_path / "run", tiny_capture, generated_views())
     commands.main(["export", str(run), "--format", "nerfstudio", "--output", str(disk.root / "export")])
     (disk.root / "report.json").write_text("old")
@@ -220,7 +225,7 @@ def test_commands_on_such_a_disk(disk: Disk, shared_path, tmp_path: Path, tiny_c
         "model": ("convert", shared_path("golden/reference")),
         "scene": ("complete", tiny_capture, "--poses-only", "--cameras", "features"),
         "room": ("rooms", "--views", 3, "--size", 64, "--held-out", 2),
-        "training": ("train", "rooms-tiny", "--device", "cpu", "--steps", 1),
+        "training": ("train", "toy", "--device", "cpu", "--steps", 1),
     }.items():
         told = refusal(capsys, *arguments, "--output", disk.root / name)
         assert f"cannot write {disk.root}" in told and reason in told, told

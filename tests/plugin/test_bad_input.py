@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.plugin.bad_input import Started, config_for, edit
+from helpers.processes.ns_train import ns_train
 from helpers.tiny_models import save_tiny_model
-from nerfstudio.scripts import train as ns_train
 from safetensors.torch import load_file, save_file
 
 from fb_core.data import media

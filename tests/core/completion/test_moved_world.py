@@ -5,6 +5,7 @@ inputs.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from fb_core.completion.fly_through import generate, plan_passes
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.context_views import nearest_context
-from fb_core.completion.planning.plan import plan_completion
+from fb_core.completion.planning.plan import CompletionPlan, plan_completion
 from fb_core.completion.planning.site import shell_of
 from fb_core.completion.requests import CompleteFrom, fan_from
 from fb_core.completion.results.completed_views import DENSIFY, CompletedViews, Origin
@@ -227,6 +228,16 @@ def test_where_new_cameras_stand_and_look(far) -> None:
     assert torch.allclose(looks[0], looks[1], atol=1e-9)
 
 
+@functools.cache
+def planned(dtype: torch.dtype, far: float, inward: bool, points: bool, anchors: int | None) -> CompletionPlan:
+    """The plan for the capture so far away; the one for the capture at home is compared with all of them."""
+    _, cameras, shift, _ = worlds(dtype, far, inward=inward)
+    config = CompletionConfig(
+        context_views=4, anchor_views=anchors, densify_rounds=2, densify_views=3, context_choice="overlap"
+    )
+    return plan_completion(single(cameras), (walls() + shift).to(dtype) if points else None, config, size=16)
+
+
 @pytest.mark.parametrize(("dtype", "far"), WORLDS)
 @pytest.mark.parametrize("inward", [False, True])
 @pytest.mark.parametrize("points", [True, False])
@@ -234,14 +245,7 @@ def test_where_new_cameras_stand_and_look(far) -> None:
 def test_the_plan_of_a_completion(dtype, far, inward, points, anchors) -> None:
     here, there, shift, rounding = worlds(dtype, far, inward=inward)
     rounding = max(rounding, 4 * torch.finfo(torch.float32).eps * far)  # of the new cameras, which are float32
-    config = CompletionConfig(
-        context_views=4, anchor_views=anchors, densify_rounds=2, densify_views=3, context_choice="overlap"
-    )
-    plans = [
-        plan_completion(single(cameras), (walls() + by).to(dtype) if points else None, config, size=16)
-        for cameras, by in ((here, 0 * shift), (there, shift))
-    ]
-    one, two = plans
+    plans = one, two = [planned(dtype, distance, inward, points, anchors) for distance in (0.0, far)]
     assert one.context == two.context and torch.allclose(one.shell.log_radius, two.shell.log_radius, atol=1e-5)
     for first, second in zip(one.rounds, two.rounds, strict=True):
         assert first.context == second.context

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import importlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import writer
 
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs.splats import fillerbuster
+
+# nerfstudio asks for the whole call stack once for each external method that it knows. Each frame of pytest's deep
+# stack then costs a walk over all modules, 10 s together; a thread has a stack of its own, without these frames.
+with ThreadPoolExecutor(1) as _thread:
+    ns_train = _thread.submit(importlib.import_module, "nerfstudio.scripts.train").result()
 
 ANCHORS, DENSIFIED = 3, 2
 

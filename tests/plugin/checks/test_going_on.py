@@ -21,8 +21,8 @@ from typing import Any
 import pytest
 import torch
 from helpers.plugin.bad_input import Started, config_for, edit
+from helpers.processes.ns_train import ns_train
 from helpers.tiny_models import save_tiny_model
-from nerfstudio.scripts import train as ns_train
 
 from fb_core.data import media
 from fb_core.files.faults import Refused

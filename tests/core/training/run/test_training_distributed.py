@@ -145,31 +145,57 @@ def test_nonsense_engines_are_refused(nonsense, shapes_unchecked):
         EngineConfig(**nonsense)
 
 
-@pytest.mark.parametrize(
-    ("ending", "code", "said"),
-    [
-        ("pass", 0, ""),
-        ("sys.exit(143)", 143, ""),
-        ("sys.exit('Error: no data.')", 1, "Error: no data."),
-        ("1 / 0", 1, "ZeroDivisionError"),
-    ],
-)
-@pytest.mark.parametrize("size", [1, 2])
-def test_a_process_of_a_group_ends_with_the_code_of_its_work(ending, code, said, size):
-    """Of several processes one ends without taking the interpreter apart (``atexit`` is not reached), one alone as
-    always.
-    """
-    program = f"""
-import atexit, sys
-from fb_core.training.run.distributed import left_at_once
+ENDINGS = {
+    "pass": (0, ""),
+    "sys.exit(143)": (143, ""),
+    "sys.exit('Error: no data.')": (1, "Error: no data."),
+    "1 / 0": (1, "ZeroDivisionError"),
+}
+ENDS = """
+import atexit
 atexit.register(print, "taken apart")
 with left_at_once():
     print("worked")
     {ending}
 """
-    environment = {**os.environ, "WORLD_SIZE": str(size), "PYTHONPATH": str(ROOT)}
-    child = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert child.returncode == code and said in child.stderr
-    assert child.stdout.split("\n")[:-1] == ["worked", "taken apart"][: 2 if size == 1 else 1]
+EACH_IN_A_PROCESS = """
+import json, os, sys
+from fb_core.training.run.distributed import left_at_once
+for number, (program, size) in enumerate(json.loads(sys.argv[1])):
+    if os.fork() == 0:
+        os.environ["WORLD_SIZE"] = str(size)
+        for stream in (1, 2):
+            os.dup2(os.open(f"{sys.argv[2]}/{number}.{stream}", os.O_CREAT | os.O_WRONLY), stream)
+        break
+    with open(f"{sys.argv[2]}/{number}.code", "w") as file:
+        file.write(str(os.waitstatus_to_exitcode(os.wait()[1])))
+else:
+    sys.exit()
+exec(program)
+"""
+"""Forks of one process that has imported torch; each runs its program as its outermost block."""
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tuple[int, str, str]]:
+    """Code, output and errors of processes by how their work ends and how many processes there are."""
+    folder = tmp_path_factory.mktemp("ended")
+    cases = [(ending, size) for ending in ENDINGS for size in (1, 2)]
+    programs = json.dumps([(ENDS.format(ending=ending), size) for ending, size in cases])
+    command = [sys.executable, "-c", EACH_IN_A_PROCESS, programs, str(folder)]
+    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, timeout=120)
+    return {
+        case: (int((folder / f"{number}.code").read_text()), *((folder / f"{number}.{n}").read_text() for n in (1, 2)))
+        for number, case in enumerate(cases)
+    }
+
+
+@pytest.mark.parametrize(("ending", "code", "said"), [(ending, *told) for ending, told in ENDINGS.items()])
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_process_of_a_group_ends_with_the_code_of_its_work(ended, ending, code, said, size):
+    """Of several processes one ends without taking the interpreter apart (``atexit`` is not reached), one alone as
+    always.
+    """
+    returned, output, errors = ended[ending, size]
+    assert returned == code and said in errors
+    assert output.split("\n")[:-1] == ["worked", "taken apart"][: 2 if size == 1 else 1]
