@@ -42,23 +42,28 @@ class Bank:
         return min(most, generated / (generated + captured))
 
     def drawn(self, step: int, *, seed: int, probability: float) -> int | None:
-        """The view that a step draws with this probability, or None; decided by seed and step alone."""
+        """The view that a step draws with this probability, or None; decided by seed and step alone.
+
+        Every view that is trained on at all is drawn equally often; what is trained on in it says what it weighs.
+        """
         draws = np.random.default_rng([seed % 2**63, step])
         if draws.random() >= probability:
             return None
-        return int(draws.choice(len(self.views), p=np.array(self.shares) / sum(self.shares)))
+        return int(draws.choice(np.flatnonzero(self.shares)))
 
     def batch(self, index: int, *, as_float: bool) -> tuple[Cameras, dict[str, Any]]:
         """Camera and batch of one view on the training's device.
 
-        ``trust`` ([h, w, 1], 0 to 1), where it is known, weighs every pixel; else that of the whole view is
+        A loss is a mean over the pixels of the mask, so ``view_weight`` is their share of the picture: a pixel counts
+        no more because few of its picture are trained on (that made clouds grow before what was captured).
+        ``trust`` ([h, w, 1], 0 to 1), where it is known, weighs every pixel; else that of the whole view is part of
         ``view_weight``.
         """
-        device, image = self.cameras.device, self.views.images[index]
+        device, image, mask = self.cameras.device, self.views.images[index], self.views.masks[index]
         image = (image.float() / 255 if as_float else image).to(device)
-        batch: dict[str, Any] = {"image": image, "mask": self.views.masks[index].to(device)}
+        batch: dict[str, Any] = {"image": image, "mask": mask.to(device), "view_weight": float(mask.float().mean())}
         if self.views.trust is None:
-            batch["view_weight"] = self.views.origins[index].trust
+            batch["view_weight"] *= self.views.origins[index].trust
         else:
             batch["trust"] = self.views.trust[index].to(device).float() / 255
         return self.cameras[index : index + 1], batch

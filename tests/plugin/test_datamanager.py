@@ -181,7 +181,8 @@ def test_float_caches_give_float_generated_images(tiny_capture: Path):
     assert images and images[0].dtype == torch.float32 and 0 <= float(images[0].min()) <= float(images[0].max()) <= 1
 
 
-def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(tiny_capture: Path):
+def test_a_pixel_counts_alike_however_many_of_its_view_are_trained_on(tiny_capture: Path):
+    """The rate of draws goes by what is trained on; a view's loss, a mean over its mask, weighs as much as its mask."""
     manager = make(tiny_capture, options(generated_share=1.0, generated_steps="shared"))
     generated(manager)
     bank = manager.generated_views
@@ -190,12 +191,13 @@ def test_generated_views_are_drawn_in_proportion_to_what_is_trained_on_in_them(t
     masks[1, : masks.shape[1] // 2] = True
     manager.generation.set_views(dataclasses.replace(bank, masks=masks))
     assert manager.generated_probability == pytest.approx(1.5 / (1.5 + 6))
-    covered = [
-        float(batch["mask"].float().mean())
+    drawn = [
+        (float(batch["mask"].float().mean()), batch["view_weight"])
         for camera, batch in map(manager.next_train, range(600))
         if not camera.metadata
     ]
-    assert set(covered) == {0.5, 1.0} and covered.count(1.0) > 1.3 * covered.count(0.5)
+    assert set(drawn) == {(0.5, 0.5), (1.0, 1.0)}, "and none of the views without a pixel"
+    assert 0.6 < drawn.count((1.0, 1.0)) / drawn.count((0.5, 0.5)) < 1.6
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.2, 0.2), (1.0, 6 / 12), (0.0, 0.0)])

@@ -305,7 +305,7 @@ def test_the_bank_gives_trust_by_pixel_and_draws_by_what_is_believed() -> None:
     trust[:, :4] = 0.8
     bank = Bank.of(with_map(trust), "cpu")
     _, batch = bank.batch(0, as_float=False)
-    assert "view_weight" not in batch and batch["trust"].shape == (16, 16, 1)
+    assert batch["view_weight"] == 1.0 and batch["trust"].shape == (16, 16, 1)
     assert torch.allclose(batch["trust"][..., 0], trust, atol=2e-3)
     assert bank.shares[0] == pytest.approx(0.2, abs=1e-3)
     nothing = Bank.of(with_map(torch.zeros(16, 16)), "cpu")
