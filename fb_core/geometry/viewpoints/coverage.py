@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -90,12 +90,15 @@ def choose_views(
     most: int,
     least_gain: float,
     worth: Float[Tensor, "c"] | None = None,
+    places: Int[Tensor, "c"] | None = None,
 ) -> ChosenViews:
     """The candidates that add most, one after the other, until the next one would add too little.
 
     A candidate adds the weight of the unseen points that it shows; points that a chosen view shows count less and less.
     It is worth its whole gain when at least a fifth of what it shows is known by then, and half of it when nothing is:
-    the model continues what it sees. Of equals the first is taken, so the order of candidates decides nothing else.
+    the model continues what it sees. A place is used again only when nothing is added from any other: views of one
+    surface from several places tell where it stands. Of equals the first is taken, so the order of candidates decides
+    nothing else.
 
     Args:
         coverage: what the capture shows.
@@ -103,6 +106,7 @@ def choose_views(
         most: views at most, 0 or more.
         least_gain: share of the unseen weight, from 0 to 1, that a view must add at least.
         worth: how much more than others each candidate is worth for what it adds; None is 1 each.
+        places: number of the place where each candidate stands, from 0; None is a place for each.
 
     Raises ValueError for bounds out of their ranges.
     """
@@ -116,14 +120,18 @@ def choose_views(
     matrix = shown.float()
     size = matrix.sum(dim=1).clamp(min=1)
     known, indices, gains = coverage.seen.clone(), list[int](), list[float]()
+    places = torch.arange(len(shown)) if places is None else places
+    unused = torch.ones(len(shown), dtype=torch.bool)
     while len(indices) < most and len(shown):
         surroundings = (matrix @ known.to(matrix)) / size
         certain = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
         added = matrix @ need.float()
         gain = torch.where((added > 0) & (added >= least), added * certain, 0.0)
-        best = int((gain if worth is None else gain * worth).argmax())
+        elsewhere = gain * unused if bool((gain * unused > 0).any()) else gain
+        best = int((elsewhere if worth is None else elsewhere * worth).argmax())
         if float(gain[best]) <= 0:
             break
+        unused &= places != places[best]
         indices.append(best)
         gains.append(float(gain[best]) / total)
         need = torch.where(shown[best], need * SEEN_AGAIN, need)
