@@ -21,9 +21,9 @@ from fb_core.geometry.viewpoints.paths import seen_by
 
 SEEN_AGAIN = 0.35
 """A surface point that a new view shows is worth this much less to the next one: one generated picture may err."""
-_CONTEXT = 0.2  # share of a view that other views should show, so that the model has something to go on from
+_CONTEXT = 0.5  # share of a view that the capture should show, so that the model has something to go on from
 _AT_ONCE = 256  # candidates, which bounds memory
-_ALONE = 0.5  # worth of a view that shows nothing known, beside one that shows enough
+_ALONE = 0.2  # worth of a view that shows nothing known, beside one that shows enough
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +63,7 @@ class ChosenViews:
     indices: tuple[int, ...]
     """Which of the candidates they are."""
     gains: tuple[float, ...]
-    """Share of all weight that each of them added when it was chosen, known surroundings counted in; never rising by
-    more than the worth of new surroundings.
-    """
+    """Share of all weight that each of them added when it was chosen, known surroundings counted in."""
     unseen_share: float
     """Share of all weight that neither a captured nor a chosen view shows."""
 
@@ -95,8 +93,8 @@ def choose_views(
     """The candidates that add most, one after the other, until the next one would add too little.
 
     A candidate adds the weight of the unseen points that it shows; points that a chosen view shows count less and less.
-    It is worth its whole gain when at least a fifth of what it shows is known by then, and half of it when nothing is:
-    the model continues what it sees. A place is used again only when nothing is added from any other: views of one
+    It is worth its whole gain when the capture shows half of what it shows, and a fifth of it when nothing: the model
+    continues what it sees, and takes its tones from there. A place is used again only when nothing is added from any other: views of one
     surface from several places tell where it stands. Of equals the first is taken, so the order of candidates decides
     nothing else.
 
@@ -119,12 +117,12 @@ def choose_views(
     least = least_gain * float(need.sum())
     matrix = shown.float()
     size = matrix.sum(dim=1).clamp(min=1)
+    surroundings = (matrix @ coverage.seen.to(matrix)) / size
+    certain = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
     known, indices, gains = coverage.seen.clone(), list[int](), list[float]()
     places = torch.arange(len(shown)) if places is None else places
     unused = torch.ones(len(shown), dtype=torch.bool)
     while len(indices) < most and len(shown):
-        surroundings = (matrix @ known.to(matrix)) / size
-        certain = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
         added = matrix @ need.float()
         gain = torch.where((added > 0) & (added >= least), added * certain, 0.0)
         elsewhere = gain * unused if bool((gain * unused > 0).any()) else gain

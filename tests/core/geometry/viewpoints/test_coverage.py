@@ -50,9 +50,17 @@ def test_unknown_beside_known_comes_first_and_what_is_shown_counts_less() -> Non
     coverage, shown = half_unseen()
     chosen = choose_views(coverage, shown, most=3, least_gain=0.0)
     assert chosen.indices[0] == 1 and set(chosen.indices[:2]) == {1, 2} and chosen.unseen_share == 0
-    assert chosen.gains[0] == pytest.approx(2 / 8) and chosen.gains[1] == pytest.approx(2 / 8 * 0.5)
+    assert chosen.gains[0] == pytest.approx(2 / 8) and chosen.gains[1] == pytest.approx(2 / 8 * 0.2)
     again = choose_views(coverage, shown[[1, 1]], most=2, least_gain=0.0)
     assert again.gains[1] == pytest.approx(SEEN_AGAIN * again.gains[0])
+
+
+def test_a_place_is_used_again_only_when_no_other_adds_anything() -> None:
+    coverage, shown = half_unseen()
+    shown[2, 4:8] = True  # from where the first one stands: two points more than it
+    chosen = choose_views(coverage, shown, most=3, least_gain=0.0, places=torch.tensor([0, 1, 1]))
+    assert chosen.indices[:2] == (1, 0), "the third adds more than the first, but stands where the second does"
+    assert chosen.indices == (1, 0, 2) and chosen.unseen_share == 0, "then it is taken all the same"
 
 
 @pytest.mark.parametrize(("least", "expected"), [(0.0, 3), (0.3, 2), (0.6, 0), (1.0, 0)])
@@ -164,7 +172,7 @@ def test_few_views_a_pure_rotation_and_views_all_alike(count: int, points: bool)
     for cameras in (turning(count, last=1.0), still, turning(1) * count):
         plan = plan_completion(cameras, cloud, AUTO, size=16)
         assert plan.covered is not None and 0 < plan.covered[0] < plan.covered[1] <= 1
-        assert 1 <= plan.new_views <= 40
+        assert 1 <= plan.new_views <= 60, "views beside what is seen come first, which takes some more"
         assert all(bool(torch.isfinite(one.cameras.camera_to_world).all()) for one in plan.rounds)
 
 
