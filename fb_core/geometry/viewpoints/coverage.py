@@ -94,9 +94,9 @@ def choose_views(
 
     A candidate adds the weight of the unseen points that it shows; points that a chosen view shows count less and less.
     It is worth its whole gain when the capture shows half of what it shows, and a fifth of it when nothing: the model
-    continues what it sees, and takes its tones from there. A place is used again only when nothing is added from any other: views of one
-    surface from several places tell where it stands. Of equals the first is taken, so the order of candidates decides
-    nothing else.
+    continues what it sees, and takes its tones from there. A place is used again only when nothing is added from any
+    other: views of one surface from several places tell where it stands. Of equals the first is taken, so the order of
+    candidates decides nothing else.
 
     Args:
         coverage: what the capture shows.
