@@ -26,7 +26,7 @@ _RESULTS = (  # a file's first bytes, and what else stands near its beginning or
     (rb"%PDF", rb"/Creator \(fillerbuster\)"),
     (rb"\{\s*\"command\": \"fillerbuster ", rb"\"rows\": "),
     (rb"part,", rb"part,"),
-    (rb"\*\*|`", rb"\n?`fillerbuster [^`\n]*`, commit [^\n]*\n\Z"),
+    (rb"\*\*|`", rb"\n?`fillerbuster [^`\n]*`, (?:model [^\n]*, )?commit [^\n]*\n\Z"),
 )
 """How results that people name begin: pictures, reports in JSON, tables in CSV and Markdown."""
 

@@ -340,6 +340,20 @@ def test_tables_as_text():
     assert "seed 5" in lines[-1] and "fillerbuster eval" in lines[-1]
 
 
+@pytest.mark.parametrize("hashed", ["f9b4db88", "-"])
+def test_the_same_command_replaces_its_own_files(hashed: str, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["fillerbuster", "eval", "model"])
+    suffixes = {"json": "json", "csv": "csv", "markdown": "md", "figure": "png"}
+    files = TableFiles(**{name: tmp_path / f"table.{suffix}" for name, suffix in suffixes.items()})
+
+    def draw(report: Report, path: Path) -> None:
+        save_figure(new_axes("dB")[0], path, origin_of(report))
+
+    for value in (1.0, 2.0):
+        files.publish(Report(seed=5, rows=[{"part": "a", "model": hashed, "value": value}]), draw)
+    assert "| 2 |" in (tmp_path / "table.md").read_text()
+
+
 def test_a_figure_says_what_it_takes_to_make_it_again(tmp_path: Path):
     rows = [{"part": "a", "model": hashed} for hashed in ("f9b4db88", "-", "0123abcd")]
     figure, _ = new_axes("dB")
