@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from fb_core.data.training.named_data import TrainingData
 from fb_core.files.faults import sentence_of
-from fb_core.machine.interruption import ENDED_BY_USER, stop_on_signals
+from fb_core.machine.interruption import ENDED_BY_USER, signals_given_back, stop_on_signals
 from fb_core.training.run.distributed import left_at_once
 from method_configs.commands.train_options import TrainOptions
 from method_configs.commands.training import train_preset
@@ -29,15 +29,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", stream=sys.stderr)
     for package in ("fb_core", "method_configs"):
         logging.getLogger(package).setLevel(logging.INFO if os.environ.get("RANK", "0") == "0" else logging.WARNING)
-    stop_on_signals()
-    given = parser().parse_args(arguments)
-    try:
-        train_preset(given.preset, given.output, options_of(given))
-    except KeyboardInterrupt:
-        sys.stderr.write("Stopped.\n")
-        sys.exit(ENDED_BY_USER)
-    except (ValueError, FloatingPointError, OSError) as error:
-        sys.exit(f"Error: {sentence_of(error)}")
+    with signals_given_back():  # whoever calls this from Python keeps their own
+        stop_on_signals()
+        given = parser().parse_args(arguments)
+        try:
+            train_preset(given.preset, given.output, options_of(given))
+        except KeyboardInterrupt:
+            sys.stderr.write("Stopped.\n")
+            sys.exit(ENDED_BY_USER)
+        except (ValueError, FloatingPointError, OSError) as error:
+            sys.exit(f"Error: {sentence_of(error)}")
 
 
 def parser() -> argparse.ArgumentParser:

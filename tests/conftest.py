@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import numpy as np
@@ -15,6 +19,7 @@ import pytest
 import shape_checks
 import torch
 from hypothesis import settings
+from torch.overrides import _get_current_function_mode_stack
 
 # Installed before any test imports fb_core: every annotated function and dataclass checks its shapes. The parts of
 # the rasterizer run thousands of times for each picture, so their shapes are tested where they meet, not at each call.
@@ -27,6 +32,8 @@ settings.register_profile("fillerbuster", deadline=None, derandomize=True, max_e
 settings.load_profile("fillerbuster")
 
 
+STOPPING = (signal.SIGINT, signal.SIGTERM)
+
 # What a user has compiled on this machine takes no part, here and in the processes that tests start: an empty folder.
 _NO_LIBRARIES = tempfile.TemporaryDirectory(prefix="fillerbuster-no-libraries-")
 os.environ["FILLERBUSTER_CACHE"] = _NO_LIBRARIES.name
@@ -35,6 +42,20 @@ os.environ["FILLERBUSTER_CACHE"] = _NO_LIBRARIES.name
 def pytest_configure(config: pytest.Config) -> None:
     """Markers live here so that a lone test file runs without warnings."""
     config.addinivalue_line("markers", "slow: takes more than a few seconds; deselect with -m 'not slow'")
+
+
+gc.disable()  # until all modules are there: what they hold stays, and looking for rubbish in it costs seconds
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """From here on rubbish is collected, among what came into being since."""
+    gc.enable()
+    gc.freeze()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """At the end everything is looked at, lest libraries that count their own objects report what stays."""
+    gc.unfreeze()
 
 
 def shared_path(relative: str) -> Path:
@@ -47,6 +68,16 @@ def shared_path(relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"shared data {relative!r} not found (set FILLERBUSTER_SHARED to the folder that holds it)")
     return path
+
+
+def state_of_process() -> dict[str, Any]:
+    """What one test could change for all that follow it."""
+    return {number.name: signal.getsignal(number) for number in STOPPING} | {
+        "default dtype": torch.get_default_dtype(),
+        "default device": torch.get_default_device(),
+        "gradients": torch.is_grad_enabled(),
+        "function modes": len(_get_current_function_mode_stack()),
+    }
 
 
 @pytest.fixture(name="shared_path", scope="session")
@@ -64,11 +95,28 @@ def shapes_unchecked():
 
 
 @pytest.fixture(autouse=True)
-def _same_random_numbers() -> None:
-    """Every test starts from the same global seeds, alone or in the suite."""
+def _as_before(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Every test starts from the same global seeds, alone or in the suite, and leaves this process as it found it.
+
+    Tests of the plugin run parts of ``ns-train``, a program that takes the signals for its own until it ends.
+    """
+    from fb_core.machine.interruption import signals_given_back
+
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
+    before = state_of_process()
+    with signals_given_back() if "plugin" in request.path.parts else nullcontext():
+        yield
+    left = {name: value for name, value in state_of_process().items() if value != before[name]}
+    if left:
+        for number in STOPPING:  # so that the tests that follow are judged by what they leave themselves
+            signal.signal(number, before[number.name])
+        torch.set_default_dtype(before["default dtype"])
+        torch.set_grad_enabled(before["gradients"])
+        if "default device" in left:
+            torch.set_default_device(None)
+        pytest.fail(f"the test leaves {left} behind, and found { {name: before[name] for name in left} }")
 
 
 @pytest.fixture(scope="session")

@@ -81,7 +81,7 @@ def seconds_of_products(products: float, device: str = "cpu") -> float:
     return products / _rate(device, torch.float32)
 
 
-def in_words(seconds: float, memory: int | None = None) -> str:
+def duration_in_words(seconds: float, memory: int | None = None) -> str:
     """What is expected, in round numbers, such as ``about 40 s, up to 0.6 GiB of memory``; without the memory where it
     is not given.
     """

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fb_core.completion.duration import in_words
+from fb_core.completion.duration import duration_in_words
 from fb_core.completion.options import CompletionConfig, PlacementConfig
 from fb_core.completion.planning.plan import CompletionPlan, PlannedRound, plan_completion
 from fb_core.completion.results.cache import CompletionCache
@@ -253,7 +253,7 @@ def expectation(sequences: Sequence[tuple[int, int]], size: int, config: Complet
         for known, generated in sequences
     ]
     seconds, most = config.samples * sum(one[0] for one in each), max(one[1] for one in each)
-    return f"; {in_words(seconds, most)}"
+    return f"; {duration_in_words(seconds, most)}"
 
 
 def _shown(aspect: float, size: int) -> Bool[Tensor, "1 h w 1"]:

@@ -88,7 +88,7 @@ def resolved(precision: Precision, device: torch.device | str = "cpu") -> torch.
     return torch.bfloat16 if bfloat16_speed(kind) >= _WORTH else torch.float32
 
 
-def in_words(precision: Precision, device: torch.device | str = "cpu") -> str:
+def precision_in_words(precision: Precision, device: torch.device | str = "cpu") -> str:
     """One line that says what was chosen and why."""
     chosen = str(resolved(precision, device)).removeprefix("torch.")
     if precision != "auto":

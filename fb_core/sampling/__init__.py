@@ -15,7 +15,7 @@ from fb_core.sampling.integration.trajectory import OnStep, OnTrajectory, Sampli
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.randomness import Orders, given_order, noise_of, random_orders
 from fb_core.sampling.reference import reference_field
-from fb_core.sampling.starts import imposed, reference_started, started, wholly_known
+from fb_core.sampling.starts import imposed, known_channels, reference_started, started
 from fb_core.sampling.tiling import Predict, tiled, windows
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "imposed",
     "integrate",
     "jumps_of",
+    "known_channels",
     "noise_of",
     "piece_of",
     "random_orders",
@@ -51,6 +52,5 @@ __all__ = [
     "started",
     "tiled",
     "time_grid",
-    "wholly_known",
     "windows",
 ]

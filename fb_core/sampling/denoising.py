@@ -19,7 +19,7 @@ from fb_core.sampling.integration.trajectory import OnStep, OnTrajectory, Trajec
 from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.randomness import Orders
 from fb_core.sampling.reference import reference_field
-from fb_core.sampling.starts import imposed, reference_started, started, wholly_known
+from fb_core.sampling.starts import imposed, known_channels, reference_started, started
 from fb_core.sampling.tiling import tiled
 
 
@@ -117,7 +117,9 @@ class Denoising:
             return self.noise
         current = self.current
         if sampling.known == "imposed":
-            current = self.conditioning.channels[:, :STATE_CHANNELS].where(wholly_known(self.conditioning) > 0, current)
+            current = self.conditioning.channels[:, :STATE_CHANNELS].where(
+                known_channels(self.conditioning) > 0, current
+            )
         return started(current, self.noise, sampling.strength)
 
     def _scale(self) -> Float[Tensor, "n 32 h w"]:
@@ -157,7 +159,10 @@ class Denoising:
         field = guided(cut_up(prepared), scale, text_scale=text_scale, variant=variant, unguided=unguided)
         if sampling.known == "imposed":
             field = imposed(
-                field, self.conditioning.channels[:, :STATE_CHANNELS], self.noise, wholly_known(self.conditioning)
+                field,
+                self.conditioning.channels[:, :STATE_CHANNELS],
+                self.noise,
+                known_channels(self.conditioning),
             )
         if self.current is not None and self.counts is not None and self._from_noise_too:
             for share in self._shares:

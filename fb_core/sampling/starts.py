@@ -57,7 +57,7 @@ def reference_started(
     return unsplit(split(started(current, noise, nearest))[0], split(noise)[1])
 
 
-def wholly_known(conditioning: Conditioning) -> Float[Tensor, "n 32 h w"]:
+def known_channels(conditioning: Conditioning) -> Float[Tensor, "n 32 h w"]:
     """1 at the latents whose pixels (or rays) are all known, 0 elsewhere."""
     return known_latents(conditioning.image_known, conditioning.rays_known)
 

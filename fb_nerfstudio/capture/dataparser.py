@@ -39,7 +39,7 @@ from fb_core.data.capture.points import read_points
 from fb_core.data.capture.transforms_json import DISTORTION_KEYS
 from fb_core.data.capture.undistort import FISHEYE_MODELS, is_too_wide, straight_camera
 from fb_core.geometry.rotations import flip_axes
-from fb_nerfstudio.capture.pictures import SMALLER_BY, WIDE_LENSES, Lens
+from fb_nerfstudio.capture.pictures import SMALLER_BY, WIDE_LENSES, WideLens
 
 _ONE_PLACE = 1e-6  # of the largest coordinate, in single precision: what it cannot tell apart
 _FAR_OFF = (
@@ -331,7 +331,7 @@ def _is_wide(frame: Frame) -> bool:
     return is_too_wide(frame.camera, frame.camera_model, frame.distortion)
 
 
-def _lens_of_frame(frame: Frame) -> Lens:
+def _lens_of_frame(frame: Frame) -> WideLens:
     return frame.camera, frame.camera_model, frame.distortion
 
 

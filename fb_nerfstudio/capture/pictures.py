@@ -23,11 +23,11 @@ from fb_core.geometry.cameras import Pinholes
 
 WIDE_LENSES = "wide_lenses"
 """Key of the dataparser's metadata: lenses that are straightened while pictures are read, by the names of these."""
-Lens = tuple[Pinholes, str, dict[str, float]]
+WideLens = tuple[Pinholes, str, dict[str, float]]
 """Camera of the bent picture, model, coefficients."""
 
 
-def straightened(pixels: Tensor, known: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+def straightened_picture(pixels: Tensor, known: Tensor, lens: WideLens) -> tuple[Tensor, Tensor]:
     """A picture [3, h, w] and its mask [1, h, w] from a lens that is too wide for nerfstudio, straight."""
     camera, model, distortion = lens
     image, mask, _ = undistort(pixels, known, camera.scaled(pixels.shape[2], pixels.shape[1]), model, distortion)
@@ -84,7 +84,7 @@ class CapturePictures(InputDataset):
         return data | self.get_metadata(data)
 
     @property
-    def _too_wide(self) -> dict[str, Lens]:
+    def _too_wide(self) -> dict[str, WideLens]:
         """Lenses, by the names of their pictures, that this dataset straightens itself, for nerfstudio cannot."""
         return self._dataparser_outputs.metadata.get(WIDE_LENSES, {})
 
@@ -96,7 +96,7 @@ class CapturePictures(InputDataset):
             mask = media.read_mask(masks[image_idx], apply_orientation=self._turned(image_idx))
             known = known * F.interpolate(mask[None], size=pixels.shape[1:])[0]
         lens = self._too_wide[str(self._dataparser_outputs.image_filenames[image_idx])]
-        return straightened(pixels, known, lens)
+        return straightened_picture(pixels, known, lens)
 
     def _turned(self, image_idx: int) -> bool:
         """Whether picture and mask are turned as the picture's EXIF tag says."""

@@ -24,7 +24,7 @@ from fb_core.geometry.shell import intersect
 from fb_core.geometry.viewpoints.paths import CaptureShape
 from fb_core.masks import wholly_known
 from fb_nerfstudio.bridge import to_pinholes
-from fb_nerfstudio.capture.pictures import WIDE_LENSES, straightened
+from fb_nerfstudio.capture.pictures import WIDE_LENSES, straightened_picture
 
 _SIDE = 960  # pixels of the longer side in which features are sought
 _MODELS = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: "OPENCV_FISHEYE"}
@@ -87,7 +87,7 @@ class _Photo:
             else torch.ones_like(image[:1])
         )
         if wide is not None:
-            image, known = straightened(image, known, wide)
+            image, known = straightened_picture(image, known, wide)
             masks.append(known)
         image, known = wholly_known(image, known, lambda channels: resize(channels, height, width))
         camera = to_pinholes(cameras[index : index + 1]).scaled(width, height)

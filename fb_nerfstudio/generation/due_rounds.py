@@ -18,7 +18,7 @@ from fb_core.completion.rounds import CapturedView, announcement_of_rounds, open
 from fb_core.completion.samples import Inpainter
 from fb_core.completion.trust import Trust, measured_trust
 from fb_core.data.capture.frames import Frame
-from fb_core.machine.precision import in_words
+from fb_core.machine.precision import precision_in_words
 from fb_nerfstudio.generation import surroundings
 from fb_nerfstudio.generation.bank import without_requested
 from fb_nerfstudio.generation.first_guess import first_guess
@@ -120,7 +120,9 @@ def _with_model(generation: Generation, scene: TrainedScene) -> CompletionPlan:
         with refusing():
             CONSOLE.print(announce(plan, config, model))
         if config.inpainter == "diffusion":
-            CONSOLE.print(f"The model's matrix products: {in_words(config.precision, generation.captured.device)}.")
+            CONSOLE.print(
+                f"The model's matrix products: {precision_in_words(config.precision, generation.captured.device)}."
+            )
         _generate(generation, scene, plan, model)
     return plan
 

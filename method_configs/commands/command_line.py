@@ -18,7 +18,7 @@ import tyro
 from fb_core.files.faults import sentence_of
 from fb_core.files.limits import MOST_SEED, require_between
 from fb_core.files.ownership import require_own_or_new
-from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, stop_on_signals
+from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, signals_given_back, stop_on_signals
 from method_configs.benchmarks.builds import Builds
 from method_configs.benchmarks.command import Networks, Precision
 from method_configs.benchmarks.fit import Fit
@@ -345,18 +345,19 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """The console script. An error that a user can mend is one sentence on stderr and a non-zero exit code."""
     _show_log()
-    stop_on_signals()
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="fillerbuster",
-            description=f"Complete casual captures. Set {DEBUG_VARIABLE}=1 for tracebacks.",
-            args=None if arguments is None else list(arguments),
-        )
-    except KeyboardInterrupt as error:
-        _stop(error, f"Stopped. {error}", ENDED_BY_USER)
-    except (ValueError, FloatingPointError, OSError) as error:
-        _stop(error, f"Error: {sentence_of(error)}", 1)
+    with signals_given_back():  # whoever calls this from Python keeps their own
+        stop_on_signals()
+        try:
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="fillerbuster",
+                description=f"Complete casual captures. Set {DEBUG_VARIABLE}=1 for tracebacks.",
+                args=None if arguments is None else list(arguments),
+            )
+        except KeyboardInterrupt as error:
+            _stop(error, f"Stopped. {error}", ENDED_BY_USER)
+        except (ValueError, FloatingPointError, OSError) as error:
+            _stop(error, f"Error: {sentence_of(error)}", 1)
 
 
 def _stop(error: BaseException, sentence: str, code: int) -> None:

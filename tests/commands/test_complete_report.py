@@ -17,7 +17,7 @@ from fb_core.data import media
 from fb_core.data.photos.straight_photos import straightened
 from fb_core.evaluation.self_consistency import photo_of
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.features.bundle_adjustment import straightened as straight_places
+from fb_core.geometry.features.bundle_adjustment import straight_places
 from fb_core.geometry.pose_solver.verdict import Arrangement
 from fb_core.registration.choice import Registration
 from method_configs.commands.complete.forecast import Forecast, forecast, memory_beside

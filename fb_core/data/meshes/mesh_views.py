@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 
 from fb_core.data.meshes.mesh_pictures import Lighting, draw_with_caster, read_mesh
-from fb_core.data.training.sequences import Encode, PoolSize, Rendered, ViewPool
+from fb_core.data.training.sequences import Encode, PoolSize, RenderedScene, ViewPool
 from fb_core.files.whole import found_below
 from fb_core.geometry.cameras import Pinholes
 from fb_core.sampling.randomness import generator_of
@@ -71,15 +71,15 @@ class MeshPool(ViewPool):
         if not files:
             raise ValueError("meshes: expected at least one file, got none")
 
-    def render(self, numbers: list[int]) -> list[Rendered]:
+    def render(self, numbers: list[int]) -> list[RenderedScene]:
         """A random file for each number; one that cannot be read is told in the log and another is drawn."""
         return [self._render(number) for number in numbers]
 
-    def _render(self, number: int) -> Rendered:
+    def _render(self, number: int) -> RenderedScene:
         generator = generator_of(self.seed, number)
         cameras = sphere_cameras(self.config, generator)
         if not self.with_images:
-            return Rendered(cameras)
+            return RenderedScene(cameras)
         background, lamp = torch.rand(3, generator=generator), F.normalize(torch.randn(3, generator=generator), dim=0)
         light = Lighting(background=tuple(background.tolist()), lamp=tuple(lamp.tolist()))
         error: Exception | None = None
@@ -87,7 +87,7 @@ class MeshPool(ViewPool):
             path = self.files[int(torch.randint(len(self.files), (), generator=generator))]
             try:
                 there, supersample = cameras.to(self.device), self.config.supersample
-                return Rendered(cameras, draw_with_caster(read_mesh(path), there, light, supersample=supersample))
+                return RenderedScene(cameras, draw_with_caster(read_mesh(path), there, light, supersample=supersample))
             except (
                 Exception
             ) as found:  # of trimesh and of what its materials hold: whatever it is, another file is drawn

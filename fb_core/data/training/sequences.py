@@ -60,7 +60,7 @@ class PoolConfig:
             raise ValueError(f"image size: expected a multiple of 16 of at least 16, got {self.image_size}")
 
 
-class Rendered(NamedTuple):
+class RenderedScene(NamedTuple):
     """A rendered scene of v views."""
 
     cameras: Pinholes
@@ -115,7 +115,7 @@ class ViewPool(ABC):
         self._ids = [-1] * scenes
 
     @abstractmethod
-    def render(self, numbers: list[int]) -> list[Rendered]:
+    def render(self, numbers: list[int]) -> list[RenderedScene]:
         """Some scenes, counted from the beginning of the training."""
 
     def slots(self, row: int, batch: int) -> range:
@@ -239,7 +239,7 @@ class RoomPool(ViewPool):
         super().__init__(size, device=device, encode=encode, with_images=with_images, with_distance=encode is not None)
         self.config, self.seed = config, seed
 
-    def render(self, numbers: list[int]) -> list[Rendered]:
+    def render(self, numbers: list[int]) -> list[RenderedScene]:
         """Rooms of the families that the curriculum has for these numbers."""
         config = self.config
         rooms, cameras = [], []
@@ -255,10 +255,10 @@ class RoomPool(ViewPool):
             cameras.append(training_cameras(room, config.views, size=config.image_size, generator=generator))
             rooms.append(room.to(self.device))
         if not self.with_images:
-            return [Rendered(group) for group in cameras]
+            return [RenderedScene(group) for group in cameras]
         rendered = render_batch(rooms, [group.to(self.device) for group in cameras], supersample=config.supersample)
         return [
-            Rendered(group, images.rgb, _distances(group, images.depth))
+            RenderedScene(group, images.rgb, _distances(group, images.depth))
             for group, images in zip(cameras, rendered, strict=True)
         ]
 

@@ -229,7 +229,7 @@ class Equations:
         )
 
 
-def settled(bundle: Bundle, *, steps: int) -> tuple[Bundle, Float[np.ndarray, "p 3 3"]]:
+def adjusted_points(bundle: Bundle, *, steps: int) -> tuple[Bundle, Float[np.ndarray, "p 3 3"]]:
     """Only the points moved to where their observations agree best, in Newton steps, and their covariance where an
     observation's deviation is its tolerance.
     """
@@ -294,7 +294,7 @@ def radial(
     return 1 + squares * (k1 + k2 * squares), 1 + squares * (3 * k1 + 5 * k2 * squares)
 
 
-def straightened(places: Float[np.ndarray, "k 2"], bend: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "k 2"]:
+def straight_places(places: Float[np.ndarray, "k 2"], bend: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "k 2"]:
     """The places in the plane at depth 1 that a lens with k1 and k2 pictures at the given ones, by Newton's method; NaN
     where none is.
     """

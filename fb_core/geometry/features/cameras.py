@@ -52,7 +52,7 @@ class FeatureCameras:
 def one_place(photos: Sequence[PhotoFeatures], panorama: Panorama, *, sure: bool) -> FeatureCameras:
     """Where rotations are all that features tell; trusted if it is sure that they explain the photos."""
     cameras = [
-        None if turn is None else camera_of(photo, turn, np.zeros(3), focal)
+        None if turn is None else camera_of_photo(photo, turn, np.zeros(3), focal)
         for photo, turn, focal in zip(photos, panorama.rotations, panorama.focal, strict=True)
     ]
     turns = [turn for turn in panorama.rotations if turn is not None]
@@ -78,7 +78,7 @@ def one_place(photos: Sequence[PhotoFeatures], panorama: Panorama, *, sure: bool
     )
 
 
-def camera_of(photo: PhotoFeatures, rotation: np.ndarray, shift: np.ndarray, focal: float) -> Pinholes:
+def camera_of_photo(photo: PhotoFeatures, rotation: np.ndarray, shift: np.ndarray, focal: float) -> Pinholes:
     """A photo's camera from its world-to-camera map and its focal length in pixels."""
     height, width = photo.size
     pose = torch.from_numpy(np.concatenate([rotation.T, -(rotation.T @ shift)[:, None]], axis=1))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fb_core.geometry.features.bundle_adjustment import Lenses, straightened
+from fb_core.geometry.features.bundle_adjustment import Lenses, straight_places
 from fb_core.geometry.features.pairs import PhotoFeatures
 
 FOCAL_GUESS = 1.2
@@ -177,4 +177,4 @@ class LensGuess:
         nothing.
         """
         number = self.lens[photo]
-        return straightened(offsets / np.asarray(self.focal[number])[..., None], self.bend[number])
+        return straight_places(offsets / np.asarray(self.focal[number])[..., None], self.bend[number])

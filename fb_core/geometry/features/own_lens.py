@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from fb_core.geometry.features.bundle_adjustment import Bundle, radial, settled
+from fb_core.geometry.features.bundle_adjustment import Bundle, adjusted_points, radial
 from fb_core.geometry.features.lenses import FOCAL_GUESSED, ONE_LENS
 from fb_core.geometry.features.trust import PESSIMISM, sigma_of
 from fb_core.geometry.pose_solver.refine import rotation_of
@@ -113,7 +113,7 @@ def sight_of(bundle: Bundle, camera: int) -> Sight:
         offsets=bundle.offsets[others],
         tolerance=bundle.tolerance[others],
     )
-    told, covariance = settled(told, steps=_POINT_STEPS)
+    told, covariance = adjusted_points(told, steps=_POINT_STEPS)
     mine = np.flatnonzero((bundle.camera_of == camera) & (number[bundle.point_of] >= 0))
     points, variance = told.points[number[bundle.point_of[mine]]], covariance[number[bundle.point_of[mine]]]
     tolerance, lens = float(bundle.tolerance[mine].mean()), bundle.lens[camera]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fb_core.geometry.features.bundle_adjustment import straightened
+from fb_core.geometry.features.bundle_adjustment import straight_places
 from fb_core.geometry.features.triangulation import detect, mutual_matches
 from fb_core.masks import resampled
 
@@ -172,7 +172,7 @@ def verified_pair(
     first = photos[i].offsets[matches[:, 0]] / focal[i]
     second = photos[j].offsets[matches[:, 1]] / focal[j]
     if bend is not None and bend.any():
-        first, second = straightened(first, bend[i]), straightened(second, bend[j])
+        first, second = straight_places(first, bend[i]), straight_places(second, bend[j])
         pictured = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
         matches, first, second = matches[pictured], first[pictured], second[pictured]
         if len(matches) < FEWEST_MATCHES:

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.features import trust
-from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straightened
-from fb_core.geometry.features.cameras import FeatureCameras, camera_of
+from fb_core.geometry.features.bundle_adjustment import Bundle, adjust, straight_places
+from fb_core.geometry.features.cameras import FeatureCameras, camera_of_photo
 from fb_core.geometry.features.lenses import LensGuess
 from fb_core.geometry.features.own_lens import LensTrial, Placed, focal_doubt, lens_doubt, lens_trial, sight_of
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, rays_through
@@ -116,7 +116,7 @@ class Reconstruction:
         best: tuple[np.ndarray, np.ndarray, np.ndarray, float] | None = None
         for factor in _FOCAL_FACTORS if unseen else _FOCAL_FACTORS[:1]:
             focal = self.lenses.focal[number] * factor
-            places = straightened(self.offsets[mine] / focal, self.lenses.bend[number])
+            places = straight_places(self.offsets[mine] / focal, self.lenses.bend[number])
             there = np.flatnonzero(np.isfinite(places[:, 0]))
             if len(there) < _FEWEST_POINTS:
                 continue
@@ -343,7 +343,7 @@ class Reconstruction:
                 continue
             mine = self.owner[used] == index
             focal = self.lenses.focal[self.lenses.lens[index]]
-            cameras.append(camera_of(photo, self.rotations[index], self.shifts[index], focal))
+            cameras.append(camera_of_photo(photo, self.rotations[index], self.shifts[index], focal))
             residuals.append(float(np.degrees(np.sqrt(np.square(misses[mine]).mean()) / focal)))
             if counts[index] < _TRUSTED_POINTS:
                 reason = trust.few_points(counts[index], _TRUSTED_POINTS, "expected")

@@ -71,7 +71,7 @@ def seeds_of(rays: Rays, *, hypotheses: int, seed: int) -> Seeds:
     )
 
 
-def camera_of(
+def camera_of_homography(
     homography: Float[Tensor, "n 3 3"], principal: Float[Tensor, "n 2"] | None, *, longest_side: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
     """Rotation, focal length and principal point (pixels) of M = R K^-1; a given principal point is kept.

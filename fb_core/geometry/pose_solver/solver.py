@@ -22,7 +22,7 @@ from fb_core.geometry.pose_solver.centers import Centers, robust_centers
 from fb_core.geometry.pose_solver.inliers import Limits, agreeing_rays, homography_of
 from fb_core.geometry.pose_solver.rays import Rays, rays_of, rays_of_raymaps, sound_rays
 from fb_core.geometry.pose_solver.refine import Fit, FocalPrior, Model, Refined, refine
-from fb_core.geometry.pose_solver.seed import camera_of, seeds_of
+from fb_core.geometry.pose_solver.seed import camera_of_homography, seeds_of
 from fb_core.geometry.pose_solver.verdict import (
     Arrangement,
     Judgement,
@@ -234,7 +234,7 @@ def _recover(
         sound = torch.tensor(
             [one.verdict is Verdict.OK for one in judgements], dtype=torch.bool, device=rays.weights.device
         )
-        rotations, focal, center = camera_of(
+        rotations, focal, center = camera_of_homography(
             seeds.homography, None if free else principal, longest_side=float(max(width, height))
         )
     centers = robust_centers(rays.origins, rays.weights, precision=rays.precision)

@@ -123,7 +123,7 @@ class Scratch:
         return layers
 
 
-def padded(width: int) -> int:
+def padded_width(width: int) -> int:
     """Row length for gathers and sums of rows: torch handles whole vectors twice as fast."""
     return -(-width // 16) * 16
 
@@ -141,7 +141,7 @@ def table_of(ellipses: Ellipses, values: Tensor, cap: float) -> Table:
     """What blocks read of every Gaussian, a row each: logarithm of the opacity, place, shape, values, and 1."""
     below = torch.nextafter(torch.tensor(ALPHA_MIN, dtype=values.dtype), torch.zeros((), dtype=values.dtype))
     used = GEOMETRY + values.shape[1] + 1
-    rows = values.new_empty(values.shape[0], padded(used))
+    rows = values.new_empty(values.shape[0], padded_width(used))
     A, B, C = (column * math.log2(math.e) for column in (ellipses.A, ellipses.B, ellipses.C))
     torch.stack([ellipses.opacity.log2(), ellipses.x, ellipses.y, A, B, C], dim=1, out=rows[:, :GEOMETRY])
     rows[:, GEOMETRY : used - 1] = values

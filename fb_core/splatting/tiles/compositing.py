@@ -28,7 +28,7 @@ from fb_core.splatting.tiles.blocks import (
     Stretch,
     Table,
     march,
-    padded,
+    padded_width,
     table_of,
 )
 from fb_core.splatting.tiles.cells import CellGrid, CellLists, Ellipses, Strips, list_cells, measure_strips, slabs
@@ -308,7 +308,7 @@ class _Composite(torch.autograd.Function):
             behind = upstream.new_zeros(grid.count, upstream.shape[2])
             pixels = _Pixels(upstream=upstream, behind=behind, light=ctx.light.clone())
             channels = values.shape[1]
-            sums = values.new_zeros(values.shape[0], padded(PULLS + channels))
+            sums = values.new_zeros(values.shape[0], padded_width(PULLS + channels))
             for number, (run, start) in reversed(list(enumerate(ctx.starts))):
                 last = number == len(ctx.starts) - 1
                 walked = ctx.walked if last else _walk(table, ellipses, ctx.strips, run, start, settings, scratch)

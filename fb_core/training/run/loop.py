@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from fb_core.machine.precision import in_words, resolved
+from fb_core.machine.precision import precision_in_words, resolved
 from fb_core.networks.transformer.blocks import Block
 from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.vae import Resnet
@@ -97,7 +97,7 @@ class Run:
         self.dtype = resolved(engine.precision, device)
         """Precision of matrix products."""
         if engine.precision == "auto" and group.is_main:
-            _logger.info("%s: matrix products in %s", stage.name, in_words("auto", device))
+            _logger.info("%s: matrix products in %s", stage.name, precision_in_words("auto", device))
         self.optimizers = self._optimizers()
         self._module = averaging(_Step(stage), group, sharded=sharded)
         self.average = Averaged(stage.network, config.average)

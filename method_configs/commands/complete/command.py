@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from fb_core import checkpoint
-from fb_core.completion.duration import in_words
+from fb_core.completion.duration import duration_in_words
 from fb_core.completion.fly_through import FEWEST, FoundCameras, choose_context, find_cameras, generate
 from fb_core.completion.results.completed_views import FLY_THROUGH, Origin
 from fb_core.data.capture.camera_path import read_camera_path
@@ -280,7 +280,9 @@ def _work(
     photos = found.as_used(job.photos)
     if plan is not None and len(found.trusted) >= FEWEST:
         _logger.info(
-            "The cameras took %.0f s; %s left.", clock.seconds["cameras"], in_words(expected.left(clock.seconds))
+            "The cameras took %.0f s; %s left.",
+            clock.seconds["cameras"],
+            duration_in_words(expected.left(clock.seconds)),
         )
     if plan is None or model is None or len(found.trusted) < FEWEST:
         return found, None, {}

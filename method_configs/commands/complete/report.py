@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from fb_core.completion.duration import in_words
+from fb_core.completion.duration import duration_in_words
 from fb_core.completion.fly_through import FoundCameras
 from fb_core.data.photos.photo import Photo
 from fb_core.geometry.pose_solver.verdict import Arrangement
@@ -45,14 +45,14 @@ def announcement_of_work(
     seconds, memory = forecast.total, memory_beside(photos, model)
     if model is None or (plan is None and unknown == 0):
         how = "known" if unknown == 0 else "features"
-        return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {in_words(seconds, memory)}."
+        return f"Finding the cameras of {len(photos)} photos{posed} by {how}; {duration_in_words(seconds, memory)}."
     if unknown and options.cameras != "features":
         assert pose_sampling is not None
         memory += _memory(model, min(len(photos), POSES_AT_ONCE), model.size, pose_sampling)
     name = "the bundled model" if options.model is None else f"model {options.model.name}"
     named = f"{name} ({model.model_hash[:8]})"
     if plan is None:
-        return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {in_words(seconds, memory)}."
+        return f"Finding the cameras of {len(photos)} photos{posed} with {named}; {duration_in_words(seconds, memory)}."
     passing = _memory(model, plan.longest, plan.side, plan.sampling, options.prompt)
     memory = max(memory, memory_beside(photos, model) + passing)
     count = len(plan.passes.views)
@@ -63,7 +63,7 @@ def announcement_of_work(
     return (
         f"Completing the scene with {named}: {sum(map(len, plan.passes.views))} new views {along} of "
         f"{plan.side}x{plan.side} pixels in "
-        f"{passes}, conditioned on {plan.photos} of {len(photos)} photos{posed}; {in_words(seconds, memory)}."
+        f"{passes}, conditioned on {plan.photos} of {len(photos)} photos{posed}; {duration_in_words(seconds, memory)}."
     )
 
 

@@ -14,12 +14,12 @@ def test_a_probe_measures_both_and_auto_follows_it(monkeypatch):
     for speed, expected in ((2.0, torch.bfloat16), (1.0, torch.float32), (0.1, torch.float32)):
         monkeypatch.setattr(precision, "bfloat16_speed", lambda device, speed=speed: speed)
         assert precision.resolved("auto") == expected
-        assert f"{speed:.1f} times" in precision.in_words("auto")
+        assert f"{speed:.1f} times" in precision.precision_in_words("auto")
 
 
 def test_what_is_asked_for_is_what_one_gets():
     assert precision.resolved("float32") == torch.float32 and precision.resolved("bfloat16") == torch.bfloat16
-    assert precision.in_words("float32") == "float32, as asked for"
+    assert precision.precision_in_words("float32") == "float32, as asked for"
     assert precision.resolved("auto", "meta") == torch.float32
 
 

@@ -15,10 +15,10 @@ from fb_core.sampling import (
     guided,
     imposed,
     integrate,
+    known_channels,
     random_orders,
     started,
     time_grid,
-    wholly_known,
 )
 from fb_core.sampling.randomness import noise_of, posterior_generators
 
@@ -164,7 +164,7 @@ def conditioning_of(*known: float) -> Conditioning:
 @pytest.mark.parametrize("start", [1.0, 0.6])
 def test_imposed_latents_are_seen_with_just_the_noise_of_each_time_and_end_as_given(solver, start):
     conditioning = conditioning_of(1.0, 0.5, 0.0)
-    known, mask, noise = conditioning.channels[:, :32], wholly_known(conditioning), drawn(3, 32, 4, 4)
+    known, mask, noise = conditioning.channels[:, :32], known_channels(conditioning), drawn(3, 32, 4, 4)
     assert mask[0].min() == 1 and mask[1:, :16].max() == 0 and mask[:, 16:].min() == 1, (
         "a partly known latent is not imposed"
     )

@@ -20,10 +20,10 @@ from fb_core.sampling import (
     guided,
     imposed,
     integrate,
+    known_channels,
     random_orders,
     tiled,
     time_grid,
-    wholly_known,
 )
 from fb_core.views import Views
 from method_configs.benchmarks.sampler.solvable_flows import Mixture
@@ -133,7 +133,7 @@ def test_gradients_through_a_whole_sampling(model, solver, name, guidance):
     for variant in (GuidanceVariant(), ALL_VARIANTS):
         scale = guidance_map(given, known=min(guidance, 1.1), unknown=guidance)
         predict = tiled(evaluated_by(model.dit, branches(given, null, scale)), window=2, orders=random_orders(0))
-        field = imposed(guided(predict, scale, variant=variant), given.channels[:, :32], noise, wholly_known(given))
+        field = imposed(guided(predict, scale, variant=variant), given.channels[:, :32], noise, known_channels(given))
         end = integrate(field, noise, time_grid(3, shift=2.0), solver=solver)
         gradients = torch.autograd.grad(end.square().sum(), [noise, given.channels])
         assert bool(torch.isfinite(end).all()) and all(bool(torch.isfinite(gradient).all()) for gradient in gradients)

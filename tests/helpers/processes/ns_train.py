@@ -8,8 +8,7 @@ import importlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from nerfstudio.utils import writer
-
+from fb_core.machine.interruption import signals_given_back
 from fb_nerfstudio.trainer import FillerbusterTrainerConfig
 from method_configs.splats import fillerbuster
 
@@ -17,6 +16,7 @@ from method_configs.splats import fillerbuster
 # stack then costs a walk over all modules, 10 s together; a thread has a stack of its own, without these frames.
 with ThreadPoolExecutor(1) as _thread:
     ns_train = _thread.submit(importlib.import_module, "nerfstudio.scripts.train").result()
+writer = importlib.import_module("nerfstudio.utils.writer")  # which needs the other one first
 
 ANCHORS, DENSIFIED = 3, 2
 
@@ -47,7 +47,8 @@ def toy_config(data: Path, output: Path, model: Path, timestamp: str) -> Fillerb
 
 
 def run_ns_train(config: FillerbusterTrainerConfig) -> None:
-    """``ns-train``, whose log writers are global and would pile up."""
+    """``ns-train``, whose log writers are global and would pile up, and which takes the signals for its own."""
     for everything in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
         everything.clear()
-    ns_train.main(config)
+    with signals_given_back():
+        ns_train.main(config)

@@ -22,7 +22,7 @@ _WIDEST_PERSPECTIVE, _WIDEST_FISHEYE = math.radians(80.0), math.radians(110.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens:
+class ColmapLens:
     """A lens as nerfstudio names it."""
 
     camera_model: str
@@ -57,14 +57,14 @@ _FITTED = (
 )
 
 
-def lens_of(camera: ColmapCamera, where: str) -> Lens:
+def lens_of(camera: ColmapCamera, where: str) -> ColmapLens:
     """The lens in nerfstudio's words. Raises ValueError, opened by ``where``, for one that those have no words for."""
     if camera.model in _BY_NAME:
         single, model, names = _BY_NAME[camera.model]
         focal, principal, rest = _split(camera, single)
         distortion = dict(zip(names, rest, strict=True))
         model = model if model != "OPENCV" or any(rest) else "PINHOLE"
-        return Lens(camera_model=model, focal=focal, principal=principal, distortion=distortion)
+        return ColmapLens(camera_model=model, focal=focal, principal=principal, distortion=distortion)
     told = f"{where}: a {camera.model} camera"
     if camera.model not in _FITTED:
         raise ValueError(
@@ -195,7 +195,7 @@ def _samples(camera: ColmapCamera) -> tuple[np.ndarray, np.ndarray]:
     return directions[kept], pixels[kept]
 
 
-def _perspective(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -> tuple[float, Lens]:
+def _perspective(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -> tuple[float, ColmapLens]:
     """(largest error in pixels, the closest Brown lens); infinite where it sees too wide."""
     if directions[:, 2].min() < math.cos(_WIDEST_PERSPECTIVE) + 1e-6:
         directions = directions[:0]
@@ -212,7 +212,7 @@ def _perspective(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarra
     return _fitted(camera, columns, pixels[: len(flat)], "OPENCV", ("k1", "k2", "k3", "p1", "p2"))
 
 
-def _fisheye(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -> tuple[float, Lens]:
+def _fisheye(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -> tuple[float, ColmapLens]:
     flat = _equidistant(directions)
     square = (flat**2).sum(axis=1)[:, None]
     columns = [flat * square**power for power in range(5)]
@@ -221,7 +221,7 @@ def _fisheye(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -
 
 def _fitted(
     camera: ColmapCamera, columns: list[np.ndarray], pixels: np.ndarray, model: str, names: tuple[str, ...]
-) -> tuple[float, Lens]:
+) -> tuple[float, ColmapLens]:
     """Least squares: a common factor of the focal lengths, and that times each coefficient, are linear in the
     pixels.
     """
@@ -229,11 +229,11 @@ def _fitted(
     matrix = np.stack([column.reshape(-1) for column in columns], axis=1)
     target = (pixels - np.array(principal)) / np.array(focal)
     if not len(pixels):
-        return math.inf, Lens(camera_model=model, focal=focal, principal=principal, distortion={})
+        return math.inf, ColmapLens(camera_model=model, focal=focal, principal=principal, distortion={})
     solution = np.linalg.lstsq(matrix, target.reshape(-1), rcond=None)[0]
     error = (matrix @ solution).reshape(-1, 2) - target
     scale = float(solution[0])
-    lens = Lens(
+    lens = ColmapLens(
         camera_model=model,
         focal=(focal[0] * scale, focal[1] * scale),
         principal=principal,

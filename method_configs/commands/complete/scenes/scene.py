@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fb_core.completion.duration import in_words
+from fb_core.completion.duration import duration_in_words
 from fb_core.completion.fly_through import FoundCameras
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.results.completed_views import CompletedViews
@@ -191,7 +191,7 @@ def announcement_of_scene(job: SceneJob, budget: SceneBudget) -> str:
         f"Training splats of {len(job.photos)} photos of up to {budget.photo_side} pixels for {budget.schedule.steps} "
         f"steps{new}, "
         f"then a film of {len(size)} pictures of {size.width}x{size.height} {along}; "
-        f"{in_words(budget.seconds, memory)}."
+        f"{duration_in_words(budget.seconds, memory)}."
     )
 
 

@@ -17,7 +17,7 @@ from helpers.scenes.features import around, bundle, cloud, lenses, perturbed, se
 
 from fb_core.evaluation.metrics.pose_metrics import aligned, pose_errors
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.features.bundle_adjustment import adjust, radial, straightened
+from fb_core.geometry.features.bundle_adjustment import adjust, radial, straight_places
 from fb_core.geometry.features.chain import FeatureCameras, chain
 from fb_core.geometry.features.pairs import PhotoFeatures
 from fb_core.geometry.features.trust import borne_out, deviations_of, flat, plane_doubt, surplus_of_a_plane
@@ -301,11 +301,11 @@ def test_straightening_undoes_bending(bend: tuple[float, float]):
     generator = np.random.default_rng(0)
     straight = generator.uniform(-0.7, 0.7, (200, 2))
     factor, _ = radial((straight**2).sum(axis=1), np.tile(bend, (200, 1)))
-    assert straightened(straight * factor[:, None], np.array(bend)) == pytest.approx(straight, abs=1e-9)
+    assert straight_places(straight * factor[:, None], np.array(bend)) == pytest.approx(straight, abs=1e-9)
 
 
 def test_places_that_a_lens_cannot_picture_have_none():
-    assert np.isnan(straightened(np.array([[3.0, 0.0]]), np.array([-0.3, 0.0]))).all()
+    assert np.isnan(straight_places(np.array([[3.0, 0.0]]), np.array([-0.3, 0.0]))).all()
 
 
 def test_the_adjustment_finds_bent_lenses():
