@@ -16,8 +16,8 @@ from fb_core.machine.interruption import signals_given_back
 @pytest.mark.parametrize(
     ("name", "change", "undo"),
     [
-        ("SIGINT", lambda: signal.signal(signal.SIGINT, signal.SIG_IGN), lambda: None),
-        ("SIGTERM", lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN), lambda: None),
+        ("SIGINT", lambda: signal.signal(signal.SIGINT, print), lambda: None),
+        ("SIGTERM", lambda: signal.signal(signal.SIGTERM, print), lambda: None),
         ("default dtype", lambda: torch.set_default_dtype(torch.float64), lambda: torch.set_default_dtype(torch.float)),
         ("default device", lambda: torch.set_default_device("meta"), lambda: torch.set_default_device(None)),
         ("function modes", lambda: torch.set_default_device("meta"), lambda: torch.set_default_device(None)),

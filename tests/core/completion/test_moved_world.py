@@ -6,31 +6,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers.tiny_models import tiny_model
+from helpers.scenes.moved_worlds import FAR, UP, away, on_lattice, room, seeded, single
 from torch import Tensor
 
-from fb_core.completion.fly_through import generate, plan_passes
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.context_views import nearest_context
 from fb_core.completion.planning.plan import CompletionPlan, plan_completion
 from fb_core.completion.planning.site import shell_of
 from fb_core.completion.requests import CompleteFrom, fan_from
 from fb_core.completion.results.completed_views import DENSIFY, CompletedViews, Origin
-from fb_core.data.photos.photo import Photo
-from fb_core.evaluation.self_consistency import photo_of
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.carry_over import carried_over
 from fb_core.geometry.features.triangulation import Features, triangulate
 from fb_core.geometry.gravity import upright
-from fb_core.geometry.known_rays import frame_of_known_rays
 from fb_core.geometry.pose_solver.solver import recover_cameras
-from fb_core.geometry.pose_solver.verdict import Arrangement
 from fb_core.geometry.raymap import CanonicalFrame, raymaps_of
 from fb_core.geometry.shell import fit_shell, intersect, sphere
 from fb_core.geometry.similarity import Similarity
@@ -47,47 +41,14 @@ from fb_core.geometry.viewpoints.paths import (
     spread_subset,
     up_of,
 )
-from fb_core.inpainter import Fillerbuster, SamplingConfig
-from fb_core.registration.by_raymaps import Square, recover_with_model
-from fb_core.registration.choice import register
-from fb_core.views import Views
 from fb_nerfstudio.capture.unseen import find_unseen, seen_by_nobody_else
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-FAR = (3e3, 1e5, 1e6)
 WORLDS = [(dtype, far) for dtype in (torch.float64, torch.float32) for far in FAR]
 NEAR = torch.tensor([4000.0, -3000.0, 500.0])  # float32 still tells a millimetre of a capture in metres there
-# Places are whole eighths: float32 holds them exactly as far as two million units off, so that a moved world is the
-# same world
-LATTICE = 8
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def away(far: float) -> Tensor:
-    return torch.tensor([far, -0.5 * far, 0.25 * far], dtype=torch.float64).round()
 
 
 def drawn(*shape: int, seed: int) -> Tensor:
     return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
-
-
-def on_lattice(places: Tensor) -> Tensor:
-    return (places * LATTICE).round() / LATTICE
-
-
-def room(count: int = 10, *, inward: bool = False) -> Pinholes:
-    """Cameras in a hall of 40 units that look out, or on a ring that look in; float64, places on the lattice."""
-    angle = torch.arange(count, dtype=torch.float64) * 2 * math.pi / count * (1.0 if inward else 0.6)
-    jitter = torch.randn(count, 3, generator=seeded(), dtype=torch.float64)
-    outward = torch.stack([angle.cos(), angle.sin(), 0.1 * jitter[:, 2]], dim=1)
-    centers = on_lattice(
-        12 * outward + jitter if inward else 4 * jitter * torch.tensor([1.0, 1.0, 0.3], dtype=torch.float64)
-    )
-    targets = torch.zeros_like(centers) if inward else centers + outward
-    return Pinholes.looking_at(centers, targets, up=UP, fov_degrees=65.0, width=32, height=24)
 
 
 def walls(count: int = 900) -> Tensor:
@@ -95,10 +56,6 @@ def walls(count: int = 900) -> Tensor:
     unit = F.normalize(torch.randn(count, 3, generator=seeded(1), dtype=torch.float64), dim=1)
     points = unit * (torch.tensor([20.0, 20.0, 9.0], dtype=torch.float64) / unit.abs()).min(dim=1, keepdim=True).values
     return on_lattice(points[points[:, 0] > 0])
-
-
-def single(cameras: Pinholes) -> list[Pinholes]:
-    return [cameras[index] for index in range(len(cameras))]
 
 
 def worlds(dtype: torch.dtype, far: float, **options) -> tuple[Pinholes, Pinholes, Tensor, float]:
@@ -355,101 +312,3 @@ def test_frames_and_what_is_carried_over() -> None:
     assert float((guesses[1].there == guesses[0].there).double().mean()) > 0.999
     both = guesses[0].there * guesses[1].there
     assert float(both.mean()) > 0.2 and float(((guesses[1].images - guesses[0].images).abs() * both).mean()) < 1e-5
-
-
-# ---- what the model is told and what it says -------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Fillerbuster:
-    return tiny_model(tmp_path_factory.mktemp("tiny"), image_size=16)
-
-
-def photos_at(cameras: list[Pinholes | None]) -> list[Photo]:
-    pictures = torch.rand(len(cameras), 3, 24, 32, generator=seeded(8))
-    return [
-        photo_of(one, name=f"p{i}", device="one", camera=camera)
-        for i, (one, camera) in enumerate(zip(pictures, cameras, strict=True))
-    ]
-
-
-FEW_STEPS = SamplingConfig(steps=2, guidance_known=1.0, guidance_unknown=1.0)
-
-
-@pytest.mark.parametrize("far", FAR)
-def test_views_of_a_fly_through(far, model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The failing case: in single precision, cameras a million units off stand on a lattice of a sixteenth of a
-    unit.
-    """
-    told, complete = list[Tensor](), model.complete
-
-    def seen(views: Views, **options: Any) -> Views:
-        frame = frame_of_known_rays(views.raymaps, views.rays_known)
-        assert frame is not None
-        told.append(frame.apply(views.raymaps))
-        return complete(views, **options)
-
-    monkeypatch.setattr(model, "complete", seen)
-    cameras = single(room(4).moved(torch.tensor([0.01, 0.02, 0.03], dtype=torch.float64)))
-    path, passes = path_cameras("ellipse", cameras, 3, size=16), plan_passes(3, room=2)
-    shift, views = away(far), []
-    for by in (torch.zeros_like(shift), shift):
-        there = [camera.moved(by) for camera in cameras]
-        views.append(generate(photos_at([*there]), there, path.moved(by), passes, model, seed=1, sampling=FEW_STEPS))
-    assert float((views[0] - views[1]).abs().max()) < 1e-5
-    for one, two in zip(told[: len(told) // 2], told[len(told) // 2 :], strict=True):
-        assert float((one - two).abs().max()) < 1e-6, "in the cube"
-
-
-@pytest.mark.parametrize("far", FAR)
-def test_cameras_by_the_model_beside_given_ones(far, model) -> None:
-    shift, cameras = away(far), single(room(4))
-    answers = []
-    for by in (torch.zeros_like(shift), shift):
-        given = [cameras[0].moved(by), cameras[1].moved(by), None, None]
-        answers.append(recover_with_model(photos_at(given), model, seed=2, sampling=FEW_STEPS, views_at_once=3))
-        assert all(found is camera for found, camera in zip(answers[-1].cameras[:2], given[:2], strict=True)), (
-            "given ones stay"
-        )
-    one, two = answers
-    assert one.reasons == two.reasons and one.raymaps.shape == two.raymaps.shape
-    there = one.raymaps + torch.cat([shift, 0 * shift])[:, None, None]
-    assert torch.allclose(there, two.raymaps, atol=1e-3, equal_nan=True)
-    exact = raymaps_of(Square.of(photos_at([*cameras])[0], 16).inside(cameras[0].moved(shift)))[0]
-    assert torch.allclose(two.raymaps[0], exact, atol=1e-5), "rays of given cameras are exact"
-    for mine, moved in zip(one.cameras, two.cameras, strict=True):
-        assert (mine is None) == (moved is None)
-        if mine is not None and moved is not None:
-            assert torch.allclose(mine.centers + shift, moved.centers, atol=2e-2)
-
-
-@pytest.mark.parametrize("far", FAR)
-def test_cameras_apart_are_apart_elsewhere(far, model) -> None:
-    shift = away(far)
-    cameras = [
-        camera.moved(0.01 * camera.centers[0] - camera.centers[0]) for camera in single(room(4))
-    ]  # a few centimetres apart
-    arrangements = {
-        register(
-            photos_at([*(camera.moved(by) for camera in cameras[:3]), None]),
-            method="model",
-            model=model,
-            seed=2,
-            sampling=FEW_STEPS,
-        ).arrangement
-        for by in (torch.zeros_like(shift), shift)
-    }
-    assert arrangements == {Arrangement.APART}
-
-
-@pytest.mark.parametrize("far", FAR)
-def test_known_views_keep_the_precision_of_their_cameras(far, model) -> None:
-    shift, cameras = away(far), dataclasses.replace(room(4), width=16, height=16)
-    pictures = torch.rand(3, 3, 16, 16, generator=seeded(9))
-    answers = []
-    for by in (torch.zeros_like(shift), shift):
-        there = cameras.moved(by)
-        views = Views.cat([Views.known(pictures, there[:3]), Views.unknown(there[[3]])])
-        assert torch.equal(views.raymaps, raymaps_of(there))
-        answers.append(model.complete(views, generator=seeded(), sampling=FEW_STEPS).images)
-    assert float((answers[0] - answers[1]).abs().max()) < 2e-4

@@ -11,7 +11,6 @@ import copy
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,31 +20,20 @@ from typing import Any
 import pytest
 import torch
 from helpers.plugin.bad_input import Started, config_for, edit
+from helpers.plugin.going_on import STEP, options, refusal
 from helpers.processes.ns_train import ns_train
 from helpers.tiny_models import save_tiny_model
 
-from fb_core.data import media
 from fb_core.files.faults import Refused
 from fb_nerfstudio.checks import run_folder
 from fb_nerfstudio.checks.going_on import CaptureIdentity, parsed
 from fb_nerfstudio.datamanager import FillerbusterDataManager
 from fb_nerfstudio.trainer import FillerbusterTrainer, FillerbusterTrainerConfig
 
-STEP = 7
-
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_tiny_model(tmp_path_factory.mktemp("model") / "model")
-
-
-def options(data: Path, model: Path, output: Path, timestamp: str) -> FillerbusterTrainerConfig:
-    config = config_for(data, model, output)
-    config.timestamp = timestamp
-    splats: Any = config.pipeline.model
-    splats.sh_degree, splats.num_random, splats.max_gaussians, splats.random_init = 1, 60, 60, True
-    splats.camera_optimizer.mode, splats.use_bilateral_grid, splats.grid_shape = "SO3xR3", True, (4, 4, 2)
-    return config
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +66,6 @@ def only_starts(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Started
 
     monkeypatch.setattr(FillerbusterTrainer, "setup", start)
-
-
-def refusal(config: FillerbusterTrainerConfig) -> str:
-    """One sentence, and no folder."""
-    before = copy.deepcopy(config)
-    with pytest.raises(Refused) as refused:
-        ns_train.main(config)
-    sentence = refused.value.code
-    assert isinstance(sentence, str) and "\n" not in sentence and len(sentence) < 600
-    assert not before.get_base_dir().exists()
-    return sentence
 
 
 # ---- another capture -------------------------------------------------------------------------------------------------
@@ -341,78 +318,3 @@ def test_runs_that_start_in_one_second_get_a_folder_each(again: FillerbusterTrai
             ns_train.main(config)
         folders.add(config.get_base_dir())
     assert len(folders) == 2
-
-
-# ---- options of the dataparser ---------------------------------------------------------------------------------------
-
-
-def test_smaller_pictures_that_nobody_has_made_are_made_in_memory(tiny_capture: Path, model: Path, tmp_path: Path):
-    """The same as from a folder images_2, and masks follow."""
-
-    def cached(factor: int | None) -> Any:
-        config = config_for(tiny_capture, model, tmp_path / "out").pipeline.datamanager
-        config.data, config.dataparser.downscale_factor = tiny_capture, factor
-        manager = config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
-        return manager.cached_train, manager.train_cameras
-
-    whole, cameras = cached(None)
-    small, small_cameras = cached(2)
-    for large, data in zip(whole, small, strict=True):
-        assert data["image"].shape == (16, 24, 3)
-        mean = torch.nn.functional.avg_pool2d(large["image"].float().movedim(-1, 0)[None], 2)[0].movedim(0, -1)
-        assert float((data["image"].float() - mean).abs().mean()) < 3
-        assert ("mask" in data) == ("mask" in large) and ("mask" not in data or data["mask"].shape == (16, 24, 1))
-    assert torch.equal(small_cameras.fx * 2, cameras.fx) and int(small_cameras.width[0]) == 24
-    folder = tiny_capture / "images_2"
-    folder.mkdir()
-    for path in (tiny_capture / "images").iterdir():
-        media.write_image(folder / path.name, torch.zeros(3, 16, 24))
-    copies, _ = cached(2)
-    assert all(int(data["image"].max()) == 0 for data in copies), "copies that are there are read"
-
-
-def test_a_second_datamanager_of_a_process_moves_what_the_first_moved(tiny_capture: Path, model: Path, tmp_path: Path):
-    """``ns-render dataset`` makes two; nerfstudio takes names out of a list that they share."""
-    config = config_for(tiny_capture, model, tmp_path / "out").pipeline.datamanager
-    config.data, config.masks_on_gpu, config.images_on_gpu = tiny_capture, True, True
-    for mode in ("inference", "test"):
-        manager = config.setup(device="cpu", test_mode=mode, world_size=1, local_rank=0)
-        assert manager.exclude_batch_keys_from_device == []
-
-
-def test_a_split_that_leaves_nothing_and_data_of_another_format_are_one_sentence(
-    tiny_capture: Path, model: Path, tmp_path: Path, only_starts
-):
-    from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-
-    config = config_for(tiny_capture, model, tmp_path / "out")
-    config.timestamp, config.pipeline.datamanager.dataparser = "run", BlenderDataParserConfig()
-    assert "BlenderDataParserConfig cannot read it" in refusal(config)
-    config = config_for(tiny_capture, model, tmp_path / "out")
-    config.timestamp, config.pipeline.datamanager.dataparser.eval_mode = "run", "filename"
-    assert re.search("cannot read it|leave no photo", refusal(config))
-
-
-def test_ctrl_c_while_the_capture_is_read_is_no_bad_capture(
-    tiny_capture: Path, model: Path, tmp_path: Path, monkeypatch, capsys
-):
-    from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    monkeypatch.setattr(
-        NerfstudioWithoutOpen3d, "_generate_dataparser_outputs", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
-    )
-    try:
-        with pytest.raises(SystemExit) as stopped:
-            ns_train.main(config_for(tiny_capture, model, tmp_path / "out"))
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    assert stopped.value.code == 130 and capsys.readouterr().err == "\nStopped; nothing was saved yet.\n"
-    assert not (tmp_path / "out").exists()
-
-
-def test_too_small_pictures_name_the_option(tiny_capture: Path, model: Path, tmp_path: Path, only_starts):
-    config = config_for(tiny_capture, model, tmp_path / "out")
-    config.timestamp, config.pipeline.datamanager.dataparser.downscale_factor = "run", 3
-    assert "got 16 x 10 after --downscale-factor 3" in refusal(config)
