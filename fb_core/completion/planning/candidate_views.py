@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -45,11 +45,6 @@ class Candidates:
     def worth(self) -> Float[Tensor, "c"] | None:
         """How much more than others each is worth for what it adds: those without parallax, whose lens is wider."""
         return None if self.wider is None else torch.where(self.wider > 1, _WITHOUT_PARALLAX, 1.0)
-
-    @property
-    def numbered(self) -> Int[Tensor, "c"]:
-        """Which place each candidate stands at, from 0; those at one place have one number."""
-        return torch.unique(self.centers, dim=0, return_inverse=True)[1]
 
     def also_seen(self, seen: Bool[Tensor, "k"]) -> Candidates:
         """The same views, where more of the scene is seen."""

@@ -215,7 +215,7 @@ def _needed_rounds(
         most=sum(sizes.values()),
         least_gain=min(1.0, more * config.least_gain),
         worth=places.worth,
-        places=places.numbered,
+        centers=places.centers,
     )
     taken = list(chosen.indices)
     if former is not None and former.number > 0 and sum(chosen.gains) < config.least_round_gain * more * left:

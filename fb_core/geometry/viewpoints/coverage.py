@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -88,7 +88,7 @@ def choose_views(
     most: int,
     least_gain: float,
     worth: Float[Tensor, "c"] | None = None,
-    places: Int[Tensor, "c"] | None = None,
+    centers: Float[Tensor, "c 3"] | None = None,
 ) -> ChosenViews:
     """The candidates that add most, one after the other, until the next one would add too little.
 
@@ -104,7 +104,7 @@ def choose_views(
         most: views at most, 0 or more.
         least_gain: share of the unseen weight, from 0 to 1, that a view must add at least.
         worth: how much more than others each candidate is worth for what it adds; None is 1 each.
-        places: number of the place where each candidate stands, from 0; None is a place for each.
+        centers: where each candidate stands; None is a place for each.
 
     Raises ValueError for bounds out of their ranges.
     """
@@ -120,8 +120,7 @@ def choose_views(
     surroundings = (matrix @ coverage.seen.to(matrix)) / size
     certain = _ALONE + (1 - _ALONE) * (surroundings / _CONTEXT).clamp(max=1)
     known, indices, gains = coverage.seen.clone(), list[int](), list[float]()
-    places = torch.arange(len(shown)) if places is None else places
-    unused = torch.ones(len(shown), dtype=torch.bool)
+    unused = torch.ones(len(shown), dtype=torch.bool, device=shown.device)
     while len(indices) < most and len(shown):
         added = matrix @ need.float()
         gain = torch.where((added > 0) & (added >= least), added * certain, 0.0)
@@ -129,7 +128,9 @@ def choose_views(
         best = int((elsewhere if worth is None else elsewhere * worth).argmax())
         if float(gain[best]) <= 0:
             break
-        unused &= places != places[best]
+        unused[best] = False
+        if centers is not None:
+            unused &= (centers != centers[best]).any(dim=1)
         indices.append(best)
         gains.append(float(gain[best]) / total)
         need = torch.where(shown[best], need * SEEN_AGAIN, need)

@@ -201,7 +201,8 @@ def test_the_splats_coarse_target():
     model = make_model(num_downscales=2, resolution_schedule=1000).train()
     model.step = 0
     batch = {"image": (image * 255).round().to(torch.uint8).movedim(0, -1), "mask": known.movedim(0, -1) > 0}
-    share, target = model._known(batch), model._target({"background": torch.zeros(3)}, batch)
+    supervision = model._supervision({"background": torch.zeros(3)}, batch)
+    share, target = supervision.known, supervision.target
     assert share is not None and target.shape == (16, 24, 3) and bool(((share > 0) & (share < 1)).any())
     assert_colour(target.movedim(-1, 0), share.movedim(-1, 0), atol=0.5 / 255 + 1e-5)
 

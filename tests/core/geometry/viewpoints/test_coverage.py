@@ -58,7 +58,7 @@ def test_unknown_beside_known_comes_first_and_what_is_shown_counts_less() -> Non
 def test_a_place_is_used_again_only_when_no_other_adds_anything() -> None:
     coverage, shown = half_unseen()
     shown[2, 4:8] = True  # from where the first one stands: two points more than it
-    chosen = choose_views(coverage, shown, most=3, least_gain=0.0, places=torch.tensor([0, 1, 1]))
+    chosen = choose_views(coverage, shown, most=3, least_gain=0.0, centers=torch.eye(3)[[0, 1, 1]])
     assert chosen.indices[:2] == (1, 0), "the third adds more than the first, but stands where the second does"
     assert chosen.indices == (1, 0, 2) and chosen.unseen_share == 0, "then it is taken all the same"
 
