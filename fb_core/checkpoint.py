@@ -173,10 +173,10 @@ def _is_model(folder: Path) -> bool:
     too.
     """
     try:
-        told = read_json(folder / CONFIG_FILE)
+        config = read_json(folder / CONFIG_FILE)
     except (OSError, ValueError):
         return False
-    return isinstance(told, dict) and {"format_version", "transformer", "image_vae", "raymap_vae"} <= set(told)
+    return isinstance(config, dict) and {"format_version", "transformer", "image_vae", "raymap_vae"} <= set(config)
 
 
 def load(

@@ -150,11 +150,11 @@ def encode_known(
     unknown ones become 0, which the autoencoders see as -1. For a ``transformer`` that attends in ray frames these are
     reckoned too. A ``guess`` (images, belief) is told where no pixel is known (:func:`with_guess`).
     """
-    told = only_known(images, image_known)
+    known_images = only_known(images, image_known)
     if guess is not None:
-        told, image_known = with_guess(told, image_known, *guess)
-    image_latents = _encoded_once(image_vae, told, image_known, encoding)
-    del told
+        known_images, image_known = with_guess(known_images, image_known, *guess)
+    image_latents = _encoded_once(image_vae, known_images, image_known, encoding)
+    del known_images
     exact = dataclasses.replace(encoding, precision=torch.float32)
     ray_latents = _encoded_once(raymap_vae, only_known(raymaps01, rays_known), rays_known, exact)
     frames = frames_for(transformer, 2 * raymaps01 - 1, rays_known)

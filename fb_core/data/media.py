@@ -312,10 +312,10 @@ def _jpeg_is_complete(file) -> bool:
             continue
         position += 2 + length
         if marker == 0xDA:  # entropy-coded data follows this header, up to the next marker
-            found = _MARKER_IN_JPEG_SCAN.search(data, position)
-            if found is None:
+            next_marker = _MARKER_IN_JPEG_SCAN.search(data, position)
+            if next_marker is None:
                 return False
-            position = found.start()
+            position = next_marker.start()
     return data[position : position + 2] == b"\xff\xd9"
 
 

@@ -146,29 +146,29 @@ def kind_of(folder: Path) -> str | None:
     """What the folder's mark says that it holds; None without a mark, or with one that does not say all that a mark
     says.
     """
-    told = _mark(folder)
-    return None if told is None else told["kind"]
+    mark = _mark(folder)
+    return None if mark is None else mark["kind"]
 
 
 def foreign_files(folder: Path) -> list[str]:
     """Files and links, by their names from the folder, that somebody else has put into a marked folder; none where no
     mark tells.
     """
-    told = _mark(folder)
+    mark = _mark(folder)
     return (
-        [] if told is None else sorted(set(_files(folder)) - {name for name in told["files"] if isinstance(name, str)})
+        [] if mark is None else sorted(set(_files(folder)) - {name for name in mark["files"] if isinstance(name, str)})
     )
 
 
 def _mark(folder: Path) -> dict | None:
     path = folder / MARK_NAME
     try:
-        told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
+        mark = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and not path.is_symlink() else None
     except (OSError, ValueError, RecursionError):
         return None
-    if not isinstance(told, dict) or told.get("made_by") != _MADE_BY or told.get("format") != _FORMAT:
+    if not isinstance(mark, dict) or mark.get("made_by") != _MADE_BY or mark.get("format") != _FORMAT:
         return None  # of others, or of a version to come, whose marks may mean something else
-    return told if isinstance(told.get("kind"), str) and isinstance(told.get("files"), list) else None
+    return mark if isinstance(mark.get("kind"), str) and isinstance(mark.get("files"), list) else None
 
 
 def _here() -> Path:
@@ -181,11 +181,11 @@ def _here() -> Path:
 
 def _files(folder: Path) -> list[str]:
     """All files and links, at any depth, without the mark."""
-    found = []
+    names = []
     for where, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(where, name))]
-        found += [Path(where, name).relative_to(folder).as_posix() for name in (*files, *links)]
-    return [name for name in found if name != MARK_NAME]
+        names += [Path(where, name).relative_to(folder).as_posix() for name in (*files, *links)]
+    return [name for name in names if name != MARK_NAME]
 
 
 def real_place(folder: Path) -> Path:

@@ -177,9 +177,9 @@ def swept(folder: Path) -> Path:
     try:
         with os.scandir(folder) as entries:
             works = [
-                (one.name, told[1])
+                (one.name, match[1])
                 for one in entries
-                if (told := _HIDDEN.fullmatch(one.name)) and one.is_dir(follow_symlinks=False)
+                if (match := _HIDDEN.fullmatch(one.name)) and one.is_dir(follow_symlinks=False)
             ]
     except OSError:
         return folder
@@ -192,8 +192,8 @@ def found_below(folder: Path, pattern: str) -> list[Path]:
     """Files and folders at or below a folder, sorted, but none that is still being written, or was when a process was
     killed.
     """
-    found = sorted(Path(folder).rglob(pattern))
-    return [path for path in found if not any(_HIDDEN.fullmatch(part) for part in path.relative_to(folder).parts)]
+    paths = sorted(Path(folder).rglob(pattern))
+    return [path for path in paths if not any(_HIDDEN.fullmatch(part) for part in path.relative_to(folder).parts)]
 
 
 # ---- changing places ------------------------------------------------------------------------------------------------
@@ -230,10 +230,10 @@ def exchange(one: Path, other: Path) -> bool:
 def _keep(previous: Path, folder: Path, why: str) -> None:
     """Put what stood at a place beside it, by a name of its own."""
     number = 1
-    while os.path.lexists(kept := folder.with_name(f"{folder.name}.replaced-{number}")):
+    while os.path.lexists(backup := folder.with_name(f"{folder.name}.replaced-{number}")):
         number += 1
-    os.rename(previous, kept)
-    _logger.warning("%s %s; what was replaced is kept as %s", folder, why, kept)
+    os.rename(previous, backup)
+    _logger.warning("%s %s; what was replaced is kept as %s", folder, why, backup)
 
 
 # ---- the hidden folders ---------------------------------------------------------------------------------------------

@@ -89,8 +89,8 @@ def carried_over(
         + lens.shift[:, None, None, None]
     )
     inside = (cosine > _LEAST_COSINE) & (place.abs() <= 1).all(dim=-1)
-    told = torch.cat([torch.where(known >= 1, images, torch.zeros_like(images)), (known >= 1).to(images)], dim=1)
-    looked_up = _sampled(told, place)
+    known_views = torch.cat([torch.where(known >= 1, images, torch.zeros_like(images)), (known >= 1).to(images)], dim=1)
+    looked_up = _sampled(known_views, place)
     inside &= looked_up[:, :, 3] > _WHOLE
     if distance is not None and known_distance is not None:
         surface = _sampled(known_distance, place, mode="nearest")[:, :, 0]

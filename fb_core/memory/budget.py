@@ -110,10 +110,10 @@ def estimate(
         raise ValueError(
             f"estimate: expected at least one view of at least one pixel, got {views} of {size[1]}x{size[0]}."
         )
-    found = _fitted(views, _padded(size), dtype, model, sampling, prompted)
-    if isinstance(found, MemoryEstimate):
-        return found
-    raise ValueError(_refusal(views, size, dtype, model, sampling, prompted, least=found))
+    fitted = _fitted(views, _padded(size), dtype, model, sampling, prompted)
+    if isinstance(fitted, MemoryEstimate):
+        return fitted
+    raise ValueError(_refusal(views, size, dtype, model, sampling, prompted, least=fitted))
 
 
 def uncut(
@@ -189,7 +189,10 @@ def _fitted(
     weights, budget = _weight_bytes(model, dtype), sampling.memory_budget_bytes
     values = 4 * views * size[0] * size[1]
     held = {phase: channels * values for phase, channels in _HELD_CHANNELS.items()}
-    room = {phase: AUTOENCODER_BYTES if budget is None else budget - weights - kept for phase, kept in held.items()}
+    room = {
+        phase: AUTOENCODER_BYTES if budget is None else budget - weights - held_bytes
+        for phase, held_bytes in held.items()
+    }
 
     views_encoded, encoding = _most_views(
         partial(_encoding_bytes, model, dtype, size), views, sampling.views_at_once, room["encoding"]
@@ -207,12 +210,12 @@ def _fitted(
             break
     networks = {"encoding": encoding, "denoising": denoising, "decoding": decoding}
     phases = {phase: max(held[phase] + network, _OWN_CHANNELS[phase] * values) for phase, network in networks.items()}
-    found = MemoryEstimate(
+    cut_estimate = MemoryEstimate(
         weights=weights,
         **phases,
         cut=Cut(views_encoded=views_encoded, views_decoded=views_decoded, tile=tile, branches=branches),
     )
-    return found if budget is None or found.peak <= budget else found.peak
+    return cut_estimate if budget is None or cut_estimate.peak <= budget else cut_estimate.peak
 
 
 def _most_views(bytes_of: Callable[[int], int], views: int, asked: int | None, room: int) -> tuple[int, int]:
@@ -318,13 +321,13 @@ def _denoising_bytes(
         )
         integrate(field, noise + 1, [*times[:2], 0.0] if len(times) > 2 else times, solver=sampling.solver)
     norms = 3 if config.text_width else 2
-    kept = 4 * norms * 2 * config.width * sampling.steps
+    block_bytes = 4 * norms * 2 * config.width * sampling.steps
     if texts is not None:
-        kept += 2 * texts.shape[0] * WORDS * config.width * dtype.itemsize
+        block_bytes += 2 * texts.shape[0] * WORDS * config.width * dtype.itemsize
     if config.known_tokens == "apart":  # at most: keys and values of all tokens, should all be known
         tokens = views * latent[0] * latent[1] // config.patch**2
-        kept += 2 * count * tokens * config.width * dtype.itemsize
-    return live.peak + (config.depth - 1) * kept + conditioning.numel() * 4
+        block_bytes += 2 * count * tokens * config.width * dtype.itemsize
+    return live.peak + (config.depth - 1) * block_bytes + conditioning.numel() * 4
 
 
 def _facts(config: DiTConfig, branches: int, views: int, latent: tuple[int, int]) -> TokenFacts:

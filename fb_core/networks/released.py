@@ -79,8 +79,8 @@ def read_state(path: Path, key: str) -> dict[str, Tensor]:
         raise ValueError(f"{path}: truncated, or not a PyTorch checkpoint ({reason:.200}).") from error
     state = content.get(key) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"{path}: expected a dictionary with the weights under {key!r}, got {found}.")
+        description = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(f"{path}: expected a dictionary with the weights under {key!r}, got {description}.")
     foreign = next((name for name in state if not isinstance(name, str)), None)
     if foreign is not None:
         raise ValueError(

@@ -34,30 +34,30 @@ def recover_with_features(
         on_progress("looking for features", number, len(photos))
         image, mask = photo.load_with_mask(LONGEST_SIDE)
         shrink = image.shape[2] / photo.size[1]
-        told = None if photo.focal_prior is None else photo.focal_prior * shrink
+        focal = None if photo.focal_prior is None else photo.focal_prior * shrink
         lens = {"lens": lens_in_words(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
-        features.append(features_of(image, mask, focal=told, **lens))
-    found = chain(features, on_progress=on_progress)
+        features.append(features_of(image, mask, focal=focal, **lens))
+    recovered = chain(features, on_progress=on_progress)
     whole = [
         camera if camera is None else camera.scaled(photo.size[1], photo.size[0])
-        for camera, photo in zip(found.cameras, photos, strict=True)
+        for camera, photo in zip(recovered.cameras, photos, strict=True)
     ]
     straight = dict[int, Photo]()
-    for index, (photo, camera, bend) in enumerate(zip(photos, whole, found.bends, strict=True)):
+    for index, (photo, camera, bend) in enumerate(zip(photos, whole, recovered.bends, strict=True)):
         if camera is not None and any(bend):
             straight[index], whole[index] = straightened(photo, camera, {"k1": bend[0], "k2": bend[1]})
-    found.cameras[:] = whole
+    recovered.cameras[:] = whole
     pairs = [
         (ours, photo.camera)
         for ours, photo in zip(whole, photos, strict=True)
         if ours is not None and photo.camera is not None
     ]
     if not pairs:
-        return found, None, straight
+        return recovered, None, straight
     placed = torch.cat([camera.centers for camera in whole if camera is not None])
     extent = float((placed - placed.mean(dim=0)).norm(dim=1).max())
     first, second = (
         (torch.cat([c.rotations for c in side]), torch.cat([c.centers for c in side]))
         for side in zip(*pairs, strict=True)
     )
-    return found, Similarity.between(first, second, scale_of_one_place=1 / extent if extent > 0 else 1.0), straight
+    return recovered, Similarity.between(first, second, scale_of_one_place=1 / extent if extent > 0 else 1.0), straight

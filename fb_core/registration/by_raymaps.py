@@ -122,11 +122,11 @@ def recover_with_model(
         return _recovered_near(photos, model, **options)
     origin = given[0].centers[0].double()
     near = [dataclasses.replace(photo, camera=_moved(photo.camera, -origin)) for photo in photos]
-    found = _recovered_near(near, model, **options)
-    back = [_moved(camera, origin) for camera in found.cameras]
+    recovered = _recovered_near(near, model, **options)
+    back = [_moved(camera, origin) for camera in recovered.cameras]
     cameras = [camera if photo.camera is None else photo.camera for photo, camera in zip(photos, back, strict=True)]
-    raymaps = found.raymaps.double() + torch.cat([origin, torch.zeros_like(origin)])[:, None, None]
-    return dataclasses.replace(found, cameras=cameras, raymaps=raymaps)
+    raymaps = recovered.raymaps.double() + torch.cat([origin, torch.zeros_like(origin)])[:, None, None]
+    return dataclasses.replace(recovered, cameras=cameras, raymaps=raymaps)
 
 
 def _moved(camera: Pinholes | None, shift: Float[Tensor, " 3"]) -> Pinholes | None:
@@ -234,23 +234,23 @@ def _solved(photos: Sequence[Photo], squares: Sequence[Square], raymaps: Float[T
         if photo.camera is None and there[index]:
             groups.setdefault(lens_in_words(photo), []).append(index)
     for members in groups.values():
-        found = recover_cameras(
+        recovered = recover_cameras(
             raymaps[members],
             principal=torch.stack([squares[index].principal for index in members]),
             focal=torch.tensor([_told_focal(photos[index], squares[index]) for index in members], dtype=torch.float64),
             solving=PoseSolving(focal="shared", square_pixels=True, focal_deviation=_TOLD),
         )
         for place, index in enumerate(members):
-            reasons[index] = found.reasons[place]
-            sides = float(found.cameras.focal[place, 0]) / squares[index].side
-            if found.verdicts[place] is Verdict.OK and not _FOCAL_SIDES[0] < sides < _FOCAL_SIDES[1]:
+            reasons[index] = recovered.reasons[place]
+            sides = float(recovered.cameras.focal[place, 0]) / squares[index].side
+            if recovered.verdicts[place] is Verdict.OK and not _FOCAL_SIDES[0] < sides < _FOCAL_SIDES[1]:
                 reasons[index] = (
                     f"its rays fit a camera of {math.degrees(2 * math.atan(0.5 / sides)):.2g} degrees of view only"
                 )
-            elif found.verdicts[place] is Verdict.OK:
-                cameras[index] = squares[index].outside(found.cameras[place].to(torch.float64))
-                residuals[index] = float(found.residual_degrees[place])
-                deviations[index] = float(found.covariance[place, 3, 3]) ** 0.5
+            elif recovered.verdicts[place] is Verdict.OK:
+                cameras[index] = squares[index].outside(recovered.cameras[place].to(torch.float64))
+                residuals[index] = float(recovered.residual_degrees[place])
+                deviations[index] = float(recovered.covariance[place, 3, 3]) ** 0.5
     return RaymapCameras(
         cameras=cameras, reasons=reasons, residuals_degrees=residuals, raymaps=raymaps, origin_deviations=deviations
     )

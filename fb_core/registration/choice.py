@@ -99,10 +99,10 @@ def register(
     if method == "model":
         assert model is not None
         sampling = sampling or dataclasses.replace(model.recommended_sampling.for_poses(), rounds=ROUNDS)
-        found = recover_with_model(
+        recovered = recover_with_model(
             photos, model, seed=seed, sampling=sampling, views_at_once=views_at_once, on_progress=report
         )
-        return _of_raymaps(photos, found)
+        return _of_raymaps(photos, recovered)
     return _of_features(photos, *recover_with_features(photos, on_progress=report))
 
 

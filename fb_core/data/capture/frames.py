@@ -198,10 +198,10 @@ def _read_frame(json_path: Path, index: int, entry: Any, shared: dict[str, Any])
 
 def _wrong_size(frame: Frame, kind: str, path: Path, stored: tuple[int, ...]) -> str:
     height, width = frame.camera.height, frame.camera.width
-    told = f"{kind} {path}: expected {width} x {height} pixels as its camera says, got {stored[1]} x {stored[0]}"
+    message = f"{kind} {path}: expected {width} x {height} pixels as its camera says, got {stored[1]} x {stored[0]}"
     if stored == (width, height) and media.image_size(path) == (height, width):
         return (
-            f"{told} stored lying on the side (EXIF orientation), which nerfstudio does not turn; save the "
+            f"{message} stored lying on the side (EXIF orientation), which nerfstudio does not turn; save the "
             "picture upright"
         )
-    return f"{told}; resize the {kind}, or process the pictures again"
+    return f"{message}; resize the {kind}, or process the pictures again"

@@ -125,15 +125,15 @@ def layouts_below(folder: Path) -> list[Path]:
     one.
     """
     files = {name: found_below(folder, name) for name in (JSON_NAME, *BLENDER_NAMES, "cameras.bin", "cameras.txt")}
-    found = {path.parent for path in files[JSON_NAME]}
-    found |= {path.parent for name in BLENDER_NAMES for path in files[name]}
+    folders = {path.parent for path in files[JSON_NAME]}
+    folders |= {path.parent for name in BLENDER_NAMES for path in files[name]}
     for path in (*files["cameras.bin"], *files["cameras.txt"]):
         if not has_model(path.parent):
             continue
         root = _folder_of(path.parent)
-        if not any(root.is_relative_to(one) or one.is_relative_to(root) for one in found if one != root):
-            found.add(root)
-    return sorted(found)
+        if not any(root.is_relative_to(one) or one.is_relative_to(root) for one in folders if one != root):
+            folders.add(root)
+    return sorted(folders)
 
 
 def other_tool(folder: Path) -> tuple[str, str] | None:
@@ -256,7 +256,7 @@ def _read_colmap(model: Path) -> Capture:
             gone,
         )
     lenses = {number: lens_of(camera, f"COLMAP model {model}") for number, camera in cameras.items()}
-    told = _provenance(root)
+    provenance = _provenance(root)
     frames = []
     for pose in there:
         camera, lens = cameras[pose.camera], lenses[pose.camera]
@@ -274,7 +274,7 @@ def _read_colmap(model: Path) -> Capture:
                 camera=_of_size_on_disk(pinhole, files[pose.name]),
                 distortion=lens.distortion,
                 camera_model=lens.camera_model,
-                extra=told.get(pose.name, {}),
+                extra=provenance.get(pose.name, {}),
             )
         )
     extra = {"applied_transform": _IDENTITY, **_lists(root, pictures, {frame.image_path for frame in frames})}
@@ -298,7 +298,7 @@ def _pictures_of(model: Path, poses: list[ColmapPose]) -> tuple[Path, Path, int]
     above = [model, *model.absolute().parents][: _UPWARDS + 1]
     for folder in above:
         reduced = {
-            path.name: int(found[1]) for path in folder.glob("images_*") if (found := _REDUCED.fullmatch(path.name))
+            path.name: int(match[1]) for path in folder.glob("images_*") if (match := _REDUCED.fullmatch(path.name))
         }
         places = [*((name, 1) for name in _PICTURES), *sorted(reduced.items(), key=lambda pair: pair[1])]
         counts = [sum(with_suffix(folder / name / pose.name).is_file() for pose in poses) for name, _ in places]
@@ -355,10 +355,10 @@ def _provenance(root: Path) -> dict[str, dict[str, Any]]:
     """What ``fillerbuster export`` has told of each picture: generated ones are no photos."""
     path = root / PROVENANCE_NAME
     try:
-        told = read_json(path) if path.is_file() else {}
+        content = read_json(path) if path.is_file() else {}
     except ValueError:
         return {}
-    entries = told.items() if isinstance(told, dict) else []
+    entries = content.items() if isinstance(content, dict) else []
     return {name: entry for name, entry in entries if isinstance(entry, dict) and "generated" in entry}
 
 
@@ -397,4 +397,4 @@ def _renamed(names: Any, folder: str) -> Any:
 
 def _reduced_folders(paths: Iterable[Path]) -> list[tuple[int, Path]]:
     """(factor, folder), the largest pictures first."""
-    return sorted((int(found[1]), path) for path in paths if path.is_dir() and (found := _REDUCED.fullmatch(path.name)))
+    return sorted((int(match[1]), path) for path in paths if path.is_dir() and (match := _REDUCED.fullmatch(path.name)))

@@ -65,7 +65,7 @@ def is_ply(path: Path) -> bool:
     except OSError:
         return False
     lines = [line.strip() for line in header.splitlines()]
-    told = [line for line in lines if line and not line.startswith((b"comment", b"obj_info"))]
-    if not end or told[:1] != [b"ply"] or len(told) < 2 or told[1] not in _FORMATS:
+    statements = [line for line in lines if line and not line.startswith((b"comment", b"obj_info"))]
+    if not end or statements[:1] != [b"ply"] or len(statements) < 2 or statements[1] not in _FORMATS:
         return False
-    return all(line.startswith((b"element ", b"property ")) for line in told[2:])
+    return all(line.startswith((b"element ", b"property ")) for line in statements[2:])

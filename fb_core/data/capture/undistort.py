@@ -142,9 +142,9 @@ def _capped(camera: Pinholes, distortion: dict[str, float]) -> Pinholes:
     """
     across, along = _side_angles(camera, distortion)
     _say_capped(round(2 * math.degrees(max(across, along))))
-    kept = math.radians(_KEPT)
+    widest = math.radians(_KEPT)
     focal = max(
-        side / 2 / math.tan(min(angle, kept)) for side, angle in ((camera.width, across), (camera.height, along))
+        side / 2 / math.tan(min(angle, widest)) for side, angle in ((camera.width, across), (camera.height, along))
     )
     middle = [camera.width / 2, camera.height / 2]
     return dataclasses.replace(
@@ -173,15 +173,15 @@ def _fisheye_angles(bent: Float[Tensor, "m"], distortion: dict[str, float]) -> F
     values = lens(table)
     falls = (values.diff() <= 0).nonzero()
     last = int(falls[0]) if len(falls) else _TABLE - 1
-    found = torch.from_numpy(np.interp(bent.double().numpy(), values[: last + 1].numpy(), table[: last + 1].numpy()))
+    off_axis = torch.from_numpy(np.interp(bent.double().numpy(), values[: last + 1].numpy(), table[: last + 1].numpy()))
     reached = bent.double().clamp(max=float(values[last]))
     for _ in range(_STEPS):
         slope = sum(
-            ((2 * power + 1) * k * found ** (2 * power) for power, k in enumerate(powers.tolist())),
-            torch.zeros_like(found),
+            ((2 * power + 1) * k * off_axis ** (2 * power) for power, k in enumerate(powers.tolist())),
+            torch.zeros_like(off_axis),
         )
-        found = (found - (lens(found) - reached) / slope.clamp(min=1e-3)).clamp(0, float(table[last]))
-    return found
+        off_axis = (off_axis - (lens(off_axis) - reached) / slope.clamp(min=1e-3)).clamp(0, float(table[last]))
+    return off_axis
 
 
 def check_straight(camera: Pinholes, camera_model: str, distortion: dict[str, float], where: str) -> None:
@@ -203,10 +203,10 @@ def check_straight(camera: Pinholes, camera_model: str, distortion: dict[str, fl
     half = min(camera.width / float(camera.focal[0, 0]), camera.height / float(camera.focal[0, 1])) / 2
     ratio = straight_camera(camera, camera_model, distortion).focal / camera.focal
     if not (farthest >= half / 2 and bool(((ratio > _FOCAL_RATIOS[0]) & (ratio < _FOCAL_RATIOS[1])).all())):
-        told = ", ".join(f"{name} = {value:g}" for name, value in distortion.items() if value)
+        coefficients = ", ".join(f"{name} = {value:g}" for name, value in distortion.items() if value)
         raise ValueError(
-            f"{where}: a lens with {told} bends the picture beyond recognition and cannot be undistorted; calibrate "
-            "it again"
+            f"{where}: a lens with {coefficients} bends the picture beyond recognition and cannot be undistorted; "
+            "calibrate it again"
         )
 
 

@@ -161,8 +161,8 @@ def _texture(part: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray] | None:
     mesh.
     """
     uv, material = getattr(part.visual, "uv", None), getattr(part.visual, "material", None)
-    found = (getattr(material, name, None) for name in ("baseColorTexture", "image"))
-    picture = next((image for image in found if image is not None), None)
+    pictures = (getattr(material, name, None) for name in ("baseColorTexture", "image"))
+    picture = next((image for image in pictures if image is not None), None)
     if uv is None or picture is None:
         return None
     uv = np.asarray(uv, dtype=np.float32)
@@ -215,12 +215,12 @@ def _colours(
     for paint in paints:
         inside = (hits.face >= first) & (hits.face < first + len(paint.corners))
         face, weights = hits.face[inside] - first, hits.weights[inside]
-        found = torch.einsum("nk,nkc->nc", weights, paint.corners[face])
+        surface_colours = torch.einsum("nk,nkc->nc", weights, paint.corners[face])
         if paint.texture is not None and paint.places is not None:
             places = torch.einsum("nk,nkc->nc", weights, paint.places[face])
             looked_up = F.grid_sample(paint.texture, places[None, :, None], padding_mode="border", align_corners=False)
-            found = found * rearrange(looked_up, "1 c n 1 -> n c")
-        colours[inside] = found * shade[hits.face[inside]][:, None]
+            surface_colours = surface_colours * rearrange(looked_up, "1 c n 1 -> n c")
+        colours[inside] = surface_colours * shade[hits.face[inside]][:, None]
         first += len(paint.corners)
     return colours
 

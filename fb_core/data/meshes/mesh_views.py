@@ -90,23 +90,23 @@ class MeshPool(ViewPool):
                 return RenderedScene(cameras, draw_with_caster(read_mesh(path), there, light, supersample=supersample))
             except (
                 Exception
-            ) as found:  # of trimesh and of what its materials hold: whatever it is, another file is drawn
-                told = found if isinstance(found, ValueError) else f"{path}: {type(found).__name__}: {found}"
-                _logger.warning("left out a mesh: %s", told)
-                error = found
+            ) as fault:  # of trimesh and of what its materials hold: whatever it is, another file is drawn
+                message = fault if isinstance(fault, ValueError) else f"{path}: {type(fault).__name__}: {fault}"
+                _logger.warning("left out a mesh: %s", message)
+                error = fault
         raise ValueError(f"meshes: {_TRIES} files in a row could not be drawn, the last because: {error}") from error
 
 
 def find_meshes(folder: Path) -> list[Path]:
     """Every mesh file at or below a folder, sorted. Raises ValueError if there is none."""
-    found = (
+    meshes = (
         [path for path in found_below(folder, "*") if path.suffix.lower() in _SUFFIXES] if Path(folder).is_dir() else []
     )
-    if not found:
+    if not meshes:
         raise ValueError(
             f"meshes: expected files of {', '.join(_SUFFIXES)} at or below {folder}, found none; check the path"
         )
-    return found
+    return meshes
 
 
 def sphere_cameras(config: MeshConfig, generator: torch.Generator) -> Pinholes:

@@ -48,10 +48,10 @@ def cast_triangles(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], ca
     x, y, size = _boxes(corners, focal, principal, camera)
     for rows in _batches(size.prod(dim=1)):
         which, pixel = _pairs(rows, x, y, size, camera.width)
-        found = _depths(edges[which], volume[which], _rays(pixel, focal, principal, camera.width))
+        depths = _depths(edges[which], volume[which], _rays(pixel, focal, principal, camera.width))
         # Of several triangles on one pixel the nearest wins; of equals (a shared edge) the first.
-        depth.scatter_reduce_(0, pixel, found, reduce="amin")
-        won = (found == depth[pixel]) & torch.isfinite(found)
+        depth.scatter_reduce_(0, pixel, depths, reduce="amin")
+        won = (depths == depth[pixel]) & torch.isfinite(depths)
         face[pixel[won].flip(0)] = which[won].flip(0)
     weights = torch.zeros(len(depth), 3, dtype=torch.float64, device=vertices.device)
     seen = (face >= 0).nonzero()[:, 0]

@@ -102,8 +102,8 @@ def _what_else(folder: Path, files: list[Path]) -> str:
     inside = [path.name for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     if inside and not files:
         return f"only folders; give the one with the photos: {folder / inside[0]}"
-    found = ", ".join(sorted({path.suffix.lower() or path.name for path in files})) or "an empty folder"
-    return f"{found}; use JPEG, PNG, WebP, TIFF, EXR or HEIC"
+    suffixes = ", ".join(sorted({path.suffix.lower() or path.name for path in files})) or "an empty folder"
+    return f"{suffixes}; use JPEG, PNG, WebP, TIFF, EXR or HEIC"
 
 
 def _still(path: Path, name: str) -> Photo:

@@ -28,10 +28,10 @@ def panorama_fault(path: Path, image: Float[Tensor, "3 h w"]) -> str:
         image: RGB in [0, 1].
     """
     height, width = image.shape[1:]
-    told = _projection(path)
-    if (told == "equirectangular" and width == 2 * height) or goes_on_at_its_edge(image):
+    projection = _projection(path)
+    if (projection == "equirectangular" and width == 2 * height) or goes_on_at_its_edge(image):
         return around_fault((height, width), kind="images")
-    if told or max(width, height) >= _LONGEST * min(width, height):
+    if projection or max(width, height) >= _LONGEST * min(width, height):
         return f"a panorama ({width} x {height}), expected a picture taken through a single lens; use the single photos"
     return ""
 
@@ -68,7 +68,7 @@ def _projection(path: Path) -> str:
     """What the file's GPano tags call its projection; empty without such tags."""
     try:
         with path.open("rb") as file:
-            found = _PROJECTION.search(file.read(_HEADER))
+            tag = _PROJECTION.search(file.read(_HEADER))
     except OSError:
         return ""
-    return found.group(1).decode("ascii", "replace").lower() if found else ""
+    return tag.group(1).decode("ascii", "replace").lower() if tag else ""

@@ -125,10 +125,10 @@ class Film:
         wanted = [one.pts for one in self.frames if one.group == frame.group and one.pts >= frame.pts][:room]
         self._kept.clear()
         for begin in (frame.pts, None):  # from the start, should a container lead to a wrong place
-            for found in _frames(self.path, [], from_pts=begin):
-                if found.pts in wanted:
-                    self._kept[found.pts] = _pixels(found, self._display)
-                if len(self._kept) == len(wanted) or (found.pts or 0) > wanted[-1]:
+            for decoded in _frames(self.path, [], from_pts=begin):
+                if decoded.pts in wanted:
+                    self._kept[decoded.pts] = _pixels(decoded, self._display)
+                if len(self._kept) == len(wanted) or (decoded.pts or 0) > wanted[-1]:
                     break
             if frame.pts in self._kept:
                 return

@@ -48,19 +48,19 @@ def free_positions(
     reach = family.camera_reach if reach is None else reach
     low, high = family.camera_height_metres
     house = room.to("cpu")
-    found, tries = torch.empty(0, 3), 0
-    while len(found) < count:
+    positions, tries = torch.empty(0, 3), 0
+    while len(positions) < count:
         draws = torch.rand(4 * count, 3, generator=generator)
         across = (draws[:, :2] - 0.5) * size[:2] * reach
         height = (low + (high - low) * draws[:, 2:]).clamp(max=float(size[2]) - CAMERA_CLEARANCE_METRES)
         points = torch.cat([across, height], dim=1)
-        found = torch.cat([found, points[house.clearance(points) >= CAMERA_CLEARANCE_METRES]])
+        positions = torch.cat([positions, points[house.clearance(points) >= CAMERA_CLEARANCE_METRES]])
         tries, reach = tries + 1, min(0.95, reach * 1.3)  # a centre crowded by furniture: look further out
         if tries > 40:
             raise ValueError(
                 f"room {room.seed} of family {family.name} has no free place for a camera; take another seed"
             )
-    return found[:count]
+    return positions[:count]
 
 
 def training_cameras(room: Room, count: int, *, size: int, generator: torch.Generator) -> Pinholes:

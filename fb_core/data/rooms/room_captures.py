@@ -216,9 +216,9 @@ def _sparse_points(room: Room, cameras: Pinholes, images: RoomImages, generator:
     chosen = torch.multinomial(weights, min(_POINTS_PER_CAPTURE, len(weights)), generator=generator)
     places = cameras.unproject(images.depth).flatten(0, 2)[chosen]
     colors = images.rgb.permute(0, 2, 3, 1).flatten(0, 2)[chosen]
-    kept = visible(room, places, cameras).sum(dim=0) >= 2
+    seen_twice = visible(room, places, cameras).sum(dim=0) >= 2
     noise = _POINT_NOISE_METRES * torch.randn(len(places), 3, generator=generator)
-    return Points(positions=(places + noise)[kept], colors=colors[kept])
+    return Points(positions=(places + noise)[seen_twice], colors=colors[seen_twice])
 
 
 def write_room_capture(capture: RoomCapture, output: Path, *, ground_truth: bool = False) -> None:

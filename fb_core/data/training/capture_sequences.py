@@ -63,14 +63,14 @@ def find_captures(folder: Path) -> list[Path]:
 
     Raises ValueError if there is none.
     """
-    found = layouts_below(Path(folder)) if Path(folder).is_dir() else []
-    if not found:
+    captures = layouts_below(Path(folder)) if Path(folder).is_dir() else []
+    if not captures:
         raise ValueError(
             f"captures: expected folders with a {JSON_NAME}, a transforms_train.json or a COLMAP model at or below "
             f"{folder}, found none; "
             "check the path"
         )
-    return found
+    return captures
 
 
 class CaptureSource:
@@ -110,9 +110,9 @@ class CaptureSource:
             folder = self.folders[int(torch.randint(len(self.folders), (), generator=generator))]
             try:
                 return self._sequence(self._capture(folder), task, generator, cameras_only)
-            except (ValueError, OSError) as found:
-                _logger.warning("left out a sequence: %s", found)
-                error = found
+            except (ValueError, OSError) as fault:
+                _logger.warning("left out a sequence: %s", fault)
+                error = fault
         raise ValueError(
             f"captures: {self.config.retries} sequences in a row could not be read, the last because: {error}"
         ) from error

@@ -190,10 +190,10 @@ class ViewPool(ABC):
         slot, chosen = framed.slot, framed.chosen
         image_known, rays_known = draw_task(len(chosen), self.image_size, task, generator=generator, device=self.device)
         latents = self._latents[slot]
-        kept = {} if latents is None else {"image_latents": latents[chosen]}
+        extras = {} if latents is None else {"image_latents": latents[chosen]}
         if self._distance is not None:
-            kept["distance"] = self._distance[slot, chosen].float() / framed.frame.scale
-        return kept | {
+            extras["distance"] = self._distance[slot, chosen].float() / framed.frame.scale
+        return extras | {
             "images": self._images[slot, chosen].float() / 255,
             "raymaps": framed.raymaps(),
             "image_known": image_known,

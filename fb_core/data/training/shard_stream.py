@@ -33,16 +33,16 @@ def find_shards(place: str) -> list[str]:
     """
     folder = Path(place)
     if folder.is_dir():
-        found = [str(path) for path in found_below(folder, "*.tar")]
+        shards = [str(path) for path in found_below(folder, "*.tar")]
     else:
         from braceexpand import braceexpand
 
-        found = list(braceexpand(place))
+        shards = list(braceexpand(place))
         if "://" not in place and not place.startswith("pipe:"):
-            found = [name for name in found if Path(name).is_file()]
-    if not found:
+            shards = [name for name in shards if Path(name).is_file()]
+    if not shards:
         raise ValueError(f"images: expected WebDataset shards (.tar files) at {place}, found none; check the path")
-    return found
+    return shards
 
 
 class ShardStream:

@@ -58,10 +58,10 @@ class LensGuess:
         members = [[photo for photo in photos if photo.lens == name] for name in names]
         first = [next((photo for photo in mine if photo.known), mine[0]) for mine in members]
         fixed = np.array([photo.known for photo in first])
-        told = [photo.focal for photo in first]
-        usual = np.array([value or FOCAL_GUESS * max(photo.size) for value, photo in zip(told, first, strict=True)])
-        start = np.array([value or guess * max(photo.size) for value, photo in zip(told, first, strict=True)])
-        tagged = np.array([value is not None for value in told])
+        focals = [photo.focal for photo in first]
+        usual = np.array([value or FOCAL_GUESS * max(photo.size) for value, photo in zip(focals, first, strict=True)])
+        start = np.array([value or guess * max(photo.size) for value, photo in zip(focals, first, strict=True)])
+        tagged = np.array([value is not None for value in focals])
         bend = np.zeros((len(names), 2))
         values = {"told": usual, "believed": tagged, "tagged": tagged, "family": np.arange(len(names)), "fixed": fixed}
         return LensGuess(lens=lens, focal=start, bend=bend, **values)

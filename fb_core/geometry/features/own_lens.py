@@ -105,7 +105,7 @@ def sight_of(bundle: Bundle, camera: int) -> Sight:
     number = np.full(len(bundle.points), -1)
     number[fixed] = np.arange(len(fixed))
     others = others[number[bundle.point_of[others]] >= 0]
-    told = dataclasses.replace(
+    others_bundle = dataclasses.replace(
         bundle,
         points=bundle.points[fixed],
         camera_of=bundle.camera_of[others],
@@ -113,9 +113,9 @@ def sight_of(bundle: Bundle, camera: int) -> Sight:
         offsets=bundle.offsets[others],
         tolerance=bundle.tolerance[others],
     )
-    told, covariance = adjusted_points(told, steps=_POINT_STEPS)
+    others_bundle, covariance = adjusted_points(others_bundle, steps=_POINT_STEPS)
     mine = np.flatnonzero((bundle.camera_of == camera) & (number[bundle.point_of] >= 0))
-    points, variance = told.points[number[bundle.point_of[mine]]], covariance[number[bundle.point_of[mine]]]
+    points, variance = others_bundle.points[number[bundle.point_of[mine]]], covariance[number[bundle.point_of[mine]]]
     tolerance, lens = float(bundle.tolerance[mine].mean()), bundle.lens[camera]
     seen = points @ bundle.rotations[camera].T + bundle.shifts[camera]
     depth = np.maximum(seen[:, 2], _NEAREST)

@@ -124,8 +124,8 @@ def candidate_pairs(photos: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
     for i in range(count):
         for j in range(i + 1, count):
             if min(len(photos[i].coarse), len(photos[j].coarse)) >= 2:
-                found = len(mutual_matches(photos[i].coarse @ photos[j].coarse.T, ratio=_RATIO)[0])
-                alike[i, j] = alike[j, i] = found
+                match_count = len(mutual_matches(photos[i].coarse @ photos[j].coarse.T, ratio=_RATIO)[0])
+                alike[i, j] = alike[j, i] = match_count
     chosen: set[tuple[int, int]] = set()
     for i in range(count):
         for j in alike[i].topk(min(_PARTNERS, count)).indices.tolist():
@@ -140,7 +140,7 @@ def match_pairs(
     """Mutual matches of all candidate pairs that a fundamental matrix or a homography explains; no focal length is
     needed for that.
     """
-    found: dict[tuple[int, int], np.ndarray] = {}
+    matches_of_pair: dict[tuple[int, int], np.ndarray] = {}
     pairs = candidate_pairs(photos)
     for number, (i, j) in enumerate(pairs):
         on_pair(number, len(pairs))
@@ -152,10 +152,10 @@ def match_pairs(
             continue
         first, second = photos[i].offsets[matches[:, 0]], photos[j].offsets[matches[:, 1]]
         tolerance = max(photos[i].tolerance, photos[j].tolerance)
-        kept = _on_epipolar_lines(first, second, tolerance)
-        if kept.sum() >= FEWEST_MATCHES:
-            found[i, j] = matches[kept]
-    return found
+        inliers = _on_epipolar_lines(first, second, tolerance)
+        if inliers.sum() >= FEWEST_MATCHES:
+            matches_of_pair[i, j] = matches[inliers]
+    return matches_of_pair
 
 
 def verified_pair(
@@ -200,10 +200,10 @@ def _on_epipolar_lines(
 
     for method in (cv2.USAC_MAGSAC, cv2.RANSAC):
         try:
-            _, kept = cv2.findFundamentalMat(first, second, method, tolerance, 0.9999, 5000)
+            _, inliers = cv2.findFundamentalMat(first, second, method, tolerance, 0.9999, 5000)
         except cv2.error:  # the first method fails an assertion of OpenCV's own on some matches of good photos
             continue
-        return np.zeros(len(first), bool) if kept is None else kept[:, 0] > 0
+        return np.zeros(len(first), bool) if inliers is None else inliers[:, 0] > 0
     return np.zeros(len(first), bool)
 
 
@@ -222,17 +222,17 @@ def _motion(
     best = np.eye(3), np.zeros((3, 1)), np.zeros(len(first), bool)
     for method in (cv2.USAC_MAGSAC, cv2.LMEDS):
         try:
-            essential, kept = cv2.findEssentialMat(first, second, np.eye(3), method, 0.9999, tolerance)
+            essential, inliers = cv2.findEssentialMat(first, second, np.eye(3), method, 0.9999, tolerance)
         except cv2.error:
             continue
-        if essential is None or essential.shape != (3, 3) or kept.sum() < FEWEST_MATCHES:
+        if essential is None or essential.shape != (3, 3) or inliers.sum() < FEWEST_MATCHES:
             continue
         near = _misses(essential, first, second) <= tolerance
-        _, rotation, translation, kept = cv2.recoverPose(
+        _, rotation, translation, inliers = cv2.recoverPose(
             essential, first, second, np.eye(3), mask=near[:, None].astype(np.uint8)
         )
-        if (kept[:, 0] > 0).sum() > best[2].sum():
-            best = rotation, translation, kept[:, 0] > 0
+        if (inliers[:, 0] > 0).sum() > best[2].sum():
+            best = rotation, translation, inliers[:, 0] > 0
         if best[2].sum() >= _IN_FRONT * near.sum():
             break
     return best

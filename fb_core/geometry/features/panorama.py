@@ -46,7 +46,7 @@ def panorama_of(
     guess if that does as well as any (photos that are identical fit every focal length).
     """
     homographies = _homographies(photos, matches)
-    total = sum(len(found) for found in matches.values())
+    total = sum(len(pair_matches) for pair_matches in matches.values())
     if not homographies:
         return Panorama(rotations=[None] * len(photos), focal=_focal(photos, guess), share=0.0)
 
@@ -75,8 +75,8 @@ def _least(miss: Callable[[float], float], *, start: float) -> float:
 
     best = int(np.argmin([miss(float(guess)) for guess in _GUESSES]))
     low, high = _GUESSES[max(0, best - 1)], _GUESSES[min(len(_GUESSES) - 1, best + 1)]
-    found: Any = minimize_scalar(miss, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
-    return float(found.x) if found.fun < miss(start) - 1e-3 else start
+    optimum: Any = minimize_scalar(miss, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
+    return float(optimum.x) if optimum.fun < miss(start) - 1e-3 else start
 
 
 def _homographies(
@@ -85,13 +85,13 @@ def _homographies(
     """Those with most matches first."""
     import cv2
 
-    found = []
+    homographies = []
     for (i, j), both in sorted(matches.items(), key=lambda item: -len(item[1])):
         places = photos[i].offsets[both[:, 0]], photos[j].offsets[both[:, 1]]
         homography, _ = cv2.findHomography(*places, cv2.USAC_MAGSAC, max(photos[i].tolerance, photos[j].tolerance))
         if homography is not None:
-            found.append(_Homography(first=i, second=j, map=homography, places=places))
-    return found
+            homographies.append(_Homography(first=i, second=j, map=homography, places=places))
+    return homographies
 
 
 def _focal(photos: Sequence[PhotoFeatures], sides: float) -> list[float]:
@@ -116,15 +116,15 @@ def _chained(
     count: int, turns: dict[tuple[int, int], Float[np.ndarray, "3 3"]]
 ) -> list[Float[np.ndarray, "3 3"] | None]:
     """World-to-camera rotations along the first of the given pairs that reach each photo."""
-    found: list[np.ndarray | None] = [None] * count
-    found[next(iter(turns))[0]] = np.eye(3)
+    rotations: list[np.ndarray | None] = [None] * count
+    rotations[next(iter(turns))[0]] = np.eye(3)
     grown = True
     while grown:
         grown = False
         for (i, j), turn in turns.items():
-            first, second = found[i], found[j]
+            first, second = rotations[i], rotations[j]
             if (first is None) != (second is None):
-                found[i], found[j] = (turn.T @ second, second) if first is None else (first, turn @ first)
+                rotations[i], rotations[j] = (turn.T @ second, second) if first is None else (first, turn @ first)
                 grown = True
                 break
-    return found
+    return rotations

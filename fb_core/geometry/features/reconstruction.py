@@ -48,10 +48,10 @@ class Reconstruction:
         links = [pair.matches + np.array([starts[pair.first], starts[pair.second]]) for pair in pairs]
         track = tracks_of(torch.from_numpy(np.concatenate(links)), int(starts[-1])).numpy()
         owner = np.repeat(np.arange(len(photos)), np.diff(starts))
-        kept = (track >= 0) & ~_twice(owner, track)
-        self.owner: Int[np.ndarray, " o"] = owner[kept]
-        self.track: Int[np.ndarray, " o"] = track[kept]
-        self.offsets: Float[np.ndarray, "o 2"] = np.concatenate([photo.offsets for photo in photos])[kept]
+        usable = (track >= 0) & ~_twice(owner, track)
+        self.owner: Int[np.ndarray, " o"] = owner[usable]
+        self.track: Int[np.ndarray, " o"] = track[usable]
+        self.offsets: Float[np.ndarray, "o 2"] = np.concatenate([photo.offsets for photo in photos])[usable]
         self.tolerance: Float[np.ndarray, " o"] = np.array([photo.tolerance for photo in photos])[self.owner]
         self.good: Bool[np.ndarray, " o"] = np.ones(len(self.owner), bool)
         self.rotations = np.tile(np.eye(3), (len(photos), 1, 1))
@@ -245,10 +245,10 @@ class Reconstruction:
         ]
         alone = self._copied(self.lenses.one_each())
         bundle, cameras, lenses, _ = alone._bundle(np.flatnonzero(alone.used))
-        found = trust.deviations_of(bundle, alone.lenses.known(lenses))
+        deviations = trust.deviations_of(bundle, alone.lenses.known(lenses))
         for camera, index in enumerate(cameras.tolist()):
             if self._own_to_tell[index]:
-                deviation = float(found.focal[found.lens[camera]])
+                deviation = float(deviations.focal[deviations.lens[camera]])
                 doubts[index] = doubts[index] or focal_doubt(deviation, told=bool(self.lenses.believed[own[index]]))
         return doubts
 
@@ -260,8 +260,8 @@ class Reconstruction:
         own = self.lenses.lens
         shared = (np.bincount(own) > 1)[own]
         vouched = shared & np.array([photo.same_lens for photo in self.photos])
-        told = self.lenses.believed[own] & (self.registered.sum() > 2)
-        return ~self.lenses.fixed[own] & ~vouched & (told | (shared & ~self.lenses.believed[own]))
+        tag_testable = self.lenses.believed[own] & (self.registered.sum() > 2)
+        return ~self.lenses.fixed[own] & ~vouched & (tag_testable | (shared & ~self.lenses.believed[own]))
 
     def _plane_doubt(self, matches: Matches) -> str:
         """What speaks against all cameras if all photos show one plane; empty if they do not."""
@@ -290,13 +290,13 @@ class Reconstruction:
 
     def pair_misses(self, matches: Matches) -> dict[tuple[int, int], Float[np.ndarray, " _"]]:
         """By how many tolerances matches of placed photos miss their epipolar lines."""
-        found = {}
+        misses = {}
         for (i, j), first, second in self._placed(matches):
             rotation = self.rotations[j] @ self.rotations[i].T
             way = self.shifts[j] - rotation @ self.shifts[i]
             scale = [self.lenses.focal[self.lenses.lens[index]] / self.photos[index].tolerance for index in (i, j)]
-            found[i, j] = trust.epipolar_misses(first, second, rotation, way) * math.sqrt(scale[0] * scale[1])
-        return found
+            misses[i, j] = trust.epipolar_misses(first, second, rotation, way) * math.sqrt(scale[0] * scale[1])
+        return misses
 
     def concluded(self, matches: Matches, trials: dict[int, LensTrial]) -> FeatureCameras:
         """Cameras, and what is to be doubted of each, given what photos say of their lenses. Photos whose lens is
@@ -327,7 +327,7 @@ class Reconstruction:
         bundle, cameras_of, lenses, _ = self._bundle(used)
         misses, counts = bundle.misses(), np.bincount(self.owner[used], minlength=len(self.photos)).tolist()
         relative = np.linalg.norm(misses, axis=1) / bundle.tolerance
-        found, sigma = trust.deviations_of(bundle, self.lenses.known(lenses)), trust.sigma_of(relative)
+        deviations, sigma = trust.deviations_of(bundle, self.lenses.known(lenses)), trust.sigma_of(relative)
         agreeing = trust.agreeing_shares(self.pair_misses(matches), len(self.photos))
         shown = np.bincount(self.owner[np.isfinite(self.points[self.track, 0])], minlength=len(self.photos))
         refused = ~self.registered & (shown >= _TRUSTED_POINTS)
@@ -351,7 +351,7 @@ class Reconstruction:
                 reason = _TWO_OF_THREE
             else:
                 reason = trust.outlying(relative[mine], sigma) or doubts[index]
-            reasons.append(reason or trust.doubt(found, int(np.searchsorted(cameras_of, index)), agreeing[index]))
+            reasons.append(reason or trust.doubt(deviations, int(np.searchsorted(cameras_of, index)), agreeing[index]))
         if reasons.count("") == 1:  # cameras stand where they stand against one another
             reasons[reasons.index("")] = trust.ALONE
         return FeatureCameras(

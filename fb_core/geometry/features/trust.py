@@ -71,11 +71,11 @@ def deviations_of(bundle: Bundle, lenses: Lenses) -> Deviations:
     within = np.diag(
         np.concatenate([np.zeros(6 * count), np.where(lenses.free, lenses.precisions(bundle), 1.0).ravel()])
     )
-    told = np.diag(
+    prior = np.diag(
         np.concatenate([np.zeros(6 * count), np.where(lenses.free, lenses.precisions(bundle), _EXACT).ravel()])
     )
     gauge = _gauge(centers, len(reduced))
-    information = (reduced - within) / sigma**2 + told  # sigma is that of observations, not of what was told
+    information = (reduced - within) / sigma**2 + prior  # sigma is that of observations, not of what was told
     own = to_world @ information @ to_world.T
     directions = np.linalg.qr(gauge)[0]
     covariance = np.linalg.inv(
@@ -229,8 +229,10 @@ def flat(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> b
         return None
     share = 0.0
     for one, other in ((first, second), (second, first)):
-        _, kept = cv2.findHomography(one[pictured], other[pictured], cv2.USAC_MAGSAC, _ON_THE_PLANE, None, 2000, 0.999)
-        share = max(share, 0.0 if kept is None else float(kept.mean()))
+        _, inliers = cv2.findHomography(
+            one[pictured], other[pictured], cv2.USAC_MAGSAC, _ON_THE_PLANE, None, 2000, 0.999
+        )
+        share = max(share, 0.0 if inliers is None else float(inliers.mean()))
     return share >= _FLAT
 
 

@@ -52,10 +52,10 @@ def two_view_rotation(
     rays = rays_through(first), rays_through(second)
     turn, misses = _rotation_alone(*rays, tolerance)
     turned = int((misses <= tolerance).sum())
-    rotation, kept, lines = _movement(first, second, rays, turn, tolerance)
-    still = np.minimum(misses[kept], _CAP * tolerance)
-    if kept.sum() >= FEWEST and (still**2).sum() > _CLEARLY * (lines[kept] ** 2).sum():
-        return Turn(rotation=rotation, inliers=int(kept.sum()), moved=True)
+    rotation, inliers, lines = _movement(first, second, rays, turn, tolerance)
+    still = np.minimum(misses[inliers], _CAP * tolerance)
+    if inliers.sum() >= FEWEST and (still**2).sum() > _CLEARLY * (lines[inliers] ** 2).sum():
+        return Turn(rotation=rotation, inliers=int(inliers.sum()), moved=True)
     return Turn(rotation=turn, inliers=turned, moved=False) if turned >= FEWEST else None
 
 
@@ -71,13 +71,13 @@ def _movement(
     def judged(rotation: np.ndarray, way: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         lines = _line_distances(first, second, rotation, way)
         near = lines <= tolerance
-        kept = near & max(
+        inliers = near & max(
             (_before(rays, rotation, sign * way, tolerance) for sign in (1, -1)),
             key=lambda before: (near & before).sum(),
         )
         return (
-            kept.sum() - np.minimum(lines / tolerance, 1).mean(),
-            kept,
+            inliers.sum() - np.minimum(lines / tolerance, 1).mean(),
+            inliers,
             lines,
         )  # the closer one of two that as many agree with
 
@@ -90,8 +90,8 @@ def _movement(
     ]
     refined = [_refined(first, second, *start, tolerance) for start in starts]
     results = [(rotation, *judged(rotation, way)) for rotation, way in refined]
-    rotation, _, kept, lines = max(results, key=lambda result: result[1])
-    return rotation, kept, lines
+    rotation, _, inliers, lines = max(results, key=lambda result: result[1])
+    return rotation, inliers, lines
 
 
 def _candidates(
@@ -102,7 +102,7 @@ def _candidates(
     """
     import cv2
 
-    found, identity = [], np.eye(3)
+    motions, identity = [], np.eye(3)
     for method in (cv2.USAC_MAGSAC, cv2.RANSAC, cv2.LMEDS):
         try:
             essential, _ = cv2.findEssentialMat(first, second, identity, method, 0.9999, tolerance)
@@ -113,16 +113,16 @@ def _candidates(
         ):  # one below the other
             if rows.shape == (3, 3) and np.isfinite(rows).all():
                 one, other, way = cv2.decomposeEssentialMat(rows)
-                found += [(one, way[:, 0]), (other, way[:, 0])]
+                motions += [(one, way[:, 0]), (other, way[:, 0])]
     plane, _ = cv2.findHomography(first, second, cv2.USAC_MAGSAC, 2 * tolerance, maxIters=5000, confidence=0.9999)
     if plane is not None and np.isfinite(plane).all():
         _, turns, ways, _ = cv2.decomposeHomographyMat(plane, identity)
-        found += [
+        motions += [
             (turn, way[:, 0] / length)
             for turn, way in zip(turns, ways, strict=True)
             if (length := np.linalg.norm(way)) > 0
         ]
-    return found
+    return motions
 
 
 def _refined(
@@ -145,8 +145,8 @@ def _refined(
     def misses(values: np.ndarray) -> np.ndarray:
         return _sampson(a, b, *at(values))
 
-    found: Any = least_squares(misses, np.zeros(5), loss="cauchy", f_scale=tolerance / 2, max_nfev=25)
-    return at(found.x)
+    optimum: Any = least_squares(misses, np.zeros(5), loss="cauchy", f_scale=tolerance / 2, max_nfev=25)
+    return at(optimum.x)
 
 
 def _line_distances(
@@ -200,12 +200,12 @@ def _rotation_alone(
     turn = turns[int(agree.sum(axis=1).argmax())]
     misses = np.radians(angles_degrees(first @ turn.T, second))
     for _ in range(5):
-        kept = misses <= tolerance
-        if kept.sum() < 2:
+        inliers = misses <= tolerance
+        if inliers.sum() < 2:
             break
-        better = nearest_rotation_between(first[kept][None], second[kept][None])[0]
+        better = nearest_rotation_between(first[inliers][None], second[inliers][None])[0]
         now = np.radians(angles_degrees(first @ better.T, second))
-        if (now <= tolerance).sum() < kept.sum():
+        if (now <= tolerance).sum() < inliers.sum():
             break
         turn, misses = better, now
     return turn, misses

@@ -52,28 +52,28 @@ def robust_centers(origins: Float[Tensor, "n 3 r"], weights: Float[Tensor, "n r"
     root = weights.sqrt()
     center = torch.zeros_like(start)
     deviation = floor
-    kept = weights
+    robust_weights = weights
     for round_ in range(_SOFT_ROUNDS + 2):
         lengths = length_of(offsets - center[..., None]) * root
         if round_ <= _SOFT_ROUNDS:
             deviation = median_over(lengths, usable) / _MEDIAN_OF_NORM_3D
         else:
-            inliers = kept > 0
+            inliers = robust_weights > 0
             degrees_of_freedom = (3 * inliers.sum(dim=1) - 3).clamp_min(1)
             deviation = (torch.where(inliers, lengths.square(), 0.0).sum(dim=1) / degrees_of_freedom).sqrt()
         deviation = torch.maximum(deviation, floor)
         relative = lengths / deviation[:, None]
         soft = weights / (1 + (relative / 3).square()).square()
-        kept = soft if round_ < _SOFT_ROUNDS else torch.where(relative <= _KEPT, weights, 0.0)
-        center = _mean(offsets, kept)
+        robust_weights = soft if round_ < _SOFT_ROUNDS else torch.where(relative <= _KEPT, weights, 0.0)
+        center = _mean(offsets, robust_weights)
     lengths = length_of(offsets - center[..., None]) * root
-    inliers = kept > 0
+    inliers = robust_weights > 0
     squares = torch.where(inliers, lengths.square(), 0.0).sum(dim=1)
     deviation = torch.maximum((squares / (3 * inliers.sum(dim=1) - 3).clamp_min(1)).sqrt(), floor)
-    total = kept.sum(dim=1)
+    total = robust_weights.sum(dim=1)
     variance = deviation.square() / torch.where(total > 0, total, 1.0)
     if origins.requires_grad:
-        center = _mean(origins - start[..., None], kept)
+        center = _mean(origins - start[..., None], robust_weights)
     return Centers(position=start + center, deviation=deviation, variance=variance, limit=_KEPT * deviation)
 
 

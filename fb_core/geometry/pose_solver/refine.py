@@ -115,21 +115,25 @@ def refine(fit: Fit, rays: Rays, model: Model) -> Refined:
     if model.shared_focal or model.square_pixels:
         fit = dataclasses.replace(fit, focal=_tied(fit.focal, rays.weights.sum(dim=1), model))
     fit, hessian = _softly(fit, fixed.leading(_SOFT_RAYS), model)
-    kept, used = fixed.weights, fixed.weights.new_ones(len(fixed.weights))
+    inlier_weights, used = fixed.weights, fixed.weights.new_ones(len(fixed.weights))
     for round_ in range(_HARD_ROUNDS):
         misses = _misses(fit, fixed)
-        deviation = _deviation(misses, kept, model) if round_ else median_over(misses, fixed.usable) / MEDIAN_OF_NORM_2D
+        deviation = (
+            _deviation(misses, inlier_weights, model)
+            if round_
+            else median_over(misses, fixed.usable) / MEDIAN_OF_NORM_2D
+        )
         deviation = deviation.clamp_min(rays.precision)
-        before, kept = kept, torch.where(misses <= _KEPT * deviation[:, None], fixed.weights, 0.0)
-        if round_ and not model.shared_focal and torch.equal(kept, before):
+        before, inlier_weights = inlier_weights, torch.where(misses <= _KEPT * deviation[:, None], fixed.weights, 0.0)
+        if round_ and not model.shared_focal and torch.equal(inlier_weights, before):
             break  # the same inliers have the same optimum
-        fit, hessian = _descend(fit, fixed, kept / deviation.square()[:, None], model, steps=_STEPS)
+        fit, hessian = _descend(fit, fixed, inlier_weights / deviation.square()[:, None], model, steps=_STEPS)
         used = deviation
-    deviation = _deviation(_misses(fit, fixed), kept, model).clamp_min(rays.precision)
+    deviation = _deviation(_misses(fit, fixed), inlier_weights, model).clamp_min(rays.precision)
     hessian = hessian * (used / deviation).square()[:, None, None]
     covariance = _covariance(fit, hessian, model)
     if rays.directions.requires_grad:
-        _, gradient, _ = _normal_equations(fit, rays, kept / deviation.square()[:, None], model)
+        _, gradient, _ = _normal_equations(fit, rays, inlier_weights / deviation.square()[:, None], model)
         fit = _moved(fit, _step(hessian, gradient, torch.zeros_like(deviation), model), model)
     return Refined(fit=fit, deviation=deviation, limit=_KEPT * deviation, covariance=covariance)
 
@@ -223,9 +227,9 @@ def _with_prior(
     off = prior.off(fit)
     off = off[:, :1] if model.square_pixels else off
     zeros = torch.zeros_like(gradient[:, : model.local])
-    told = information[:, None] * torch.cat([zeros, torch.ones_like(off)], dim=1)
+    diagonal = information[:, None] * torch.cat([zeros, torch.ones_like(off)], dim=1)
     return (
-        hessian + torch.diag_embed(told),
+        hessian + torch.diag_embed(diagonal),
         gradient + torch.cat([zeros, information[:, None] * off], dim=1),
         cost + information * off.square().sum(dim=1),
     )

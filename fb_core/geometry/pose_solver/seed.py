@@ -55,12 +55,14 @@ def seeds_of(rays: Rays, *, hypotheses: int, seed: int) -> Seeds:
     )
     homography = _consensus(candidates, plane, rays)
     for _ in range(_LINEAR_ROUNDS):
-        homography, kept, lengths, _ = _softly(homography, plane, rays.directions, rays.weights, rays.precision)
-        homography = _linear(plane, rays.directions, kept / lengths.square().clamp_min(_TINY))
-    homography, kept, _, deviation = _softly(homography, plane, rays.directions, rays.weights, rays.precision)
+        homography, robust_weights, lengths, _ = _softly(
+            homography, plane, rays.directions, rays.weights, rays.precision
+        )
+        homography = _linear(plane, rays.directions, robust_weights / lengths.square().clamp_min(_TINY))
+    homography, robust_weights, _, deviation = _softly(homography, plane, rays.directions, rays.weights, rays.precision)
     mapped = homography @ plane
     mapped = mapped / length_of(mapped).clamp_min(_TINY)[:, None]
-    share = kept / kept.sum(dim=1, keepdim=True).clamp_min(_TINY)
+    share = robust_weights / robust_weights.sum(dim=1, keepdim=True).clamp_min(_TINY)
     mean = torch.einsum("nr,nir->ni", share, mapped)
     spread = (share * (mapped - mean[..., None]).square().sum(dim=1)).sum(dim=1).sqrt()
     return Seeds(
@@ -87,9 +89,11 @@ def camera_of_homography(
         scale = upper[:, 2, 2].clamp_min(_TINY)
         focal = scale[:, None] / upper.diagonal(dim1=1, dim2=2)[:, :2].clamp_min(_TINY)
         focal = focal.clamp(1e-4 * longest_side, 1e7 * longest_side)
-        found = -upper[:, :2, 2] / scale[:, None] * focal
-        found = torch.where((found.abs() < 1e3 * longest_side).all(dim=1, keepdim=True), found, 0.5 * longest_side)
-        return _proper(unitary * signs[:, None, :]), focal, found
+        principal_point = -upper[:, :2, 2] / scale[:, None] * focal
+        principal_point = torch.where(
+            (principal_point.abs() < 1e3 * longest_side).all(dim=1, keepdim=True), principal_point, 0.5 * longest_side
+        )
+        return _proper(unitary * signs[:, None, :]), focal, principal_point
     shift = identity.clone()
     shift[:, :2, 2] = principal
     columns = homography @ shift
@@ -183,8 +187,8 @@ def _consensus(
     views = torch.arange(len(candidates), device=best.device).repeat_interleave(count)
     part = (plane[..., more][views], rays.directions[..., more][views], rays.weights[:, more][views])
     for _ in range(_LINEAR_ROUNDS):
-        finalists, kept, lengths, _ = _softly(finalists, *part, rays.precision)
-        finalists = _linear(part[0], part[1], kept / lengths.square().clamp_min(_TINY))
+        finalists, robust_weights, lengths, _ = _softly(finalists, *part, rays.precision)
+        finalists = _linear(part[0], part[1], robust_weights / lengths.square().clamp_min(_TINY))
     finalists = torch.cat(
         [
             finalists.unflatten(0, (-1, count)),
@@ -231,5 +235,5 @@ def _softly(
     sign = torch.where((along * weights).sum(dim=1) < 0, -1.0, 1.0)
     squared = (sign[:, None, None] * mapped / lengths[:, None] - directions).square().sum(dim=1) * weights
     deviation = (median_over(squared, weights > 0).sqrt() / MEDIAN_OF_NORM_2D).clamp_min(precision)
-    kept = weights / (1 + squared / (2.5 * deviation[:, None]).square()).square()
-    return sign[:, None, None] * homography, kept, lengths, deviation
+    robust_weights = weights / (1 + squared / (2.5 * deviation[:, None]).square()).square()
+    return sign[:, None, None] * homography, robust_weights, lengths, deviation

@@ -151,12 +151,12 @@ def recover_cameras(
     if focal is not None and (tuple(focal.shape) != (count,) or bool((focal <= 0).any())):
         raise ValueError(f"focal: expected {count} positive lengths or NaN, one for each raymap, got {focal.tolist()}")
     prior = None if focal is None else FocalPrior(focal=focal.to(rays.pixels), deviation=solving.focal_deviation)
-    found = _recover(rays, principal, width, height, solving, prior=prior, dtype=_working(raymaps.dtype))
-    like = raymaps.detach().to(found.cameras.focal.dtype)
+    recovered = _recover(rays, principal, width, height, solving, prior=prior, dtype=_working(raymaps.dtype))
+    like = raymaps.detach().to(recovered.cameras.focal.dtype)
     x = torch.arange(width, device=like.device, dtype=like.dtype)[None, None] + 0.5
     y = torch.arange(height, device=like.device, dtype=like.dtype)[None, :, None] + 0.5
-    agreeing = agreeing_rays(like, x, y, weights[:, 0], _limits(found))
-    return _concluded(found, agreeing, (weights[:, 0] > 0) & sound, solving)
+    agreeing = agreeing_rays(like, x, y, weights[:, 0], _limits(recovered))
+    return _concluded(recovered, agreeing, (weights[:, 0] > 0) & sound, solving)
 
 
 def recover_cameras_from_rays(
@@ -183,11 +183,13 @@ def recover_cameras_from_rays(
         raise ValueError("pixels: expected finite coordinates, got NaN or infinity; give such rays weight 0")
     rays = torch.cat([origins, directions], dim=2).transpose(1, 2)
     points = pixels.transpose(1, 2)
-    found = _recover(rays_of(rays, points, weights), principal, width, height, solving, dtype=_working(origins.dtype))
+    recovered = _recover(
+        rays_of(rays, points, weights), principal, width, height, solving, dtype=_working(origins.dtype)
+    )
     sound = sound_rays(rays.detach())
-    like, points = rays.detach().to(found.cameras.focal.dtype), points.to(found.cameras.focal.dtype)
-    agreeing = agreeing_rays(like, points[:, 0], points[:, 1], weights, _limits(found))
-    return _concluded(found, agreeing, (weights > 0) & sound, solving)
+    like, points = rays.detach().to(recovered.cameras.focal.dtype), points.to(recovered.cameras.focal.dtype)
+    agreeing = agreeing_rays(like, points[:, 0], points[:, 1], weights, _limits(recovered))
+    return _concluded(recovered, agreeing, (weights > 0) & sound, solving)
 
 
 @dataclass(frozen=True, kw_only=True)

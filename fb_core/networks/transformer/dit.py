@@ -195,9 +195,9 @@ class DiT(nn.Module):
             raise ValueError(f"sequence: expected {self.config.in_channels} channels, got {count}.")
         known, noisy = self.known_of(facts), self.config.out_channels
         modulation, texts, frames = self.modulate(time), self.text_context(text), self.frames_of(facts)
-        state, told, channels = sequence[:, :, :noisy], sequence[:, :, noisy : 2 * noisy], sequence
+        state, known_latents, channels = sequence[:, :, :noisy], sequence[:, :, noisy : 2 * noisy], sequence
         if known is not None:
-            channels = torch.cat([self.where_known(known, told, state), sequence[:, :, noisy:]], dim=2)
+            channels = torch.cat([self.where_known(known, known_latents, state), sequence[:, :, noisy:]], dim=2)
         tokens = self.embed_patches(channels) + self.positions(views, height, width, index, device=sequence.device)
         if known is None:
             velocity = self.run_blocks(tokens, modulation, texts, frames)
@@ -206,7 +206,7 @@ class DiT(nn.Module):
         looked_up = self.run_known(tokens, apart, texts, frames)
         velocity = self.run_unknown(tokens, others, looked_up, modulation, texts, frames)
         velocity = self.unpatchify(velocity, views, height, width).to(sequence.dtype)
-        return self.where_known(known, self.leading_to(told, state, time), velocity)
+        return self.where_known(known, self.leading_to(known_latents, state, time), velocity)
 
     def known_of(self, facts: TokenFacts) -> Bool[Tensor, "b n h w"] | None:
         """Which tokens stand apart; None where none does."""

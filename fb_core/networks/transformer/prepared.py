@@ -166,11 +166,14 @@ class Prepared:
         contexts = [self._context(context, part) for context in self._contexts]
         apart = None
         if known is not None and self._told is not None:
-            told = chosen(self._told)
+            known_latents = chosen(self._told)
             stream, others = streams(rearrange(known, "b n h w -> b (n h w)"))
-            clean = self.dit.embed_patches(told, bias=False) + self._positions[count] + tokens
+            clean = self.dit.embed_patches(known_latents, bias=False) + self._positions[count] + tokens
             apart = _Apart(
-                known=known, told=told, others=others, looked_up=self.dit.run_known(clean, stream, contexts, frames)
+                known=known,
+                told=known_latents,
+                others=others,
+                looked_up=self.dit.run_known(clean, stream, contexts, frames),
             )
         bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart)
         if views is None:

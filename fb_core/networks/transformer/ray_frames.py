@@ -85,10 +85,10 @@ def frames_of_rays(
     basis = torch.stack([torch.ones_like(right), right, down], dim=1)
     normal = torch.einsum("...p,pi,pj->...ij", weight, basis, basis)
     whole = torch.linalg.det(basis.T @ basis)
-    told = torch.linalg.det(normal) > _LEAST_SPREAD * whole
+    determined = torch.linalg.det(normal) > _LEAST_SPREAD * whole
     identity = torch.eye(3, device=raymaps.device, dtype=dtype)
     fit = torch.linalg.solve(
-        torch.where(told[..., None, None], normal, identity), torch.einsum("...pc,pi->...ic", rays, basis)
+        torch.where(determined[..., None, None], normal, identity), torch.einsum("...pc,pi->...ic", rays, basis)
     )
     forward = F.normalize(fit[..., 0, 3:], dim=-1)
     across = fit[..., 1, 3:]
@@ -98,8 +98,8 @@ def frames_of_rays(
     frames[..., :3, 0], frames[..., :3, 1], frames[..., :3, 2] = across, torch.linalg.cross(forward, across), forward
     frames[..., :3, 3] = origin
     frames[..., 3, 3] = 1.0
-    told = told & (forward.norm(dim=-1) > 0.5) & (across.norm(dim=-1) > 0.5)
-    return torch.where(told[..., None, None], frames, torch.eye(VECTOR, device=raymaps.device, dtype=dtype))
+    determined = determined & (forward.norm(dim=-1) > 0.5) & (across.norm(dim=-1) > 0.5)
+    return torch.where(determined[..., None, None], frames, torch.eye(VECTOR, device=raymaps.device, dtype=dtype))
 
 
 def transformed(

@@ -65,20 +65,20 @@ def lens_of(camera: ColmapCamera, where: str) -> ColmapLens:
         distortion = dict(zip(names, rest, strict=True))
         model = model if model != "OPENCV" or any(rest) else "PINHOLE"
         return ColmapLens(camera_model=model, focal=focal, principal=principal, distortion=distortion)
-    told = f"{where}: a {camera.model} camera"
+    opening = f"{where}: a {camera.model} camera"
     if camera.model not in _FITTED:
         raise ValueError(
-            f"{told} is no lens that a splat can be trained with; cut its pictures into perspective views first"
+            f"{opening} is no lens that a splat can be trained with; cut its pictures into perspective views first"
         )
     directions, pixels = _samples(camera)
     if len(pixels) < 16:
-        raise ValueError(f"{told} with {[*camera.params]} sees nothing of its picture; calibrate it again")
+        raise ValueError(f"{opening} with {[*camera.params]} sees nothing of its picture; calibrate it again")
     (off, lens), _ = sorted(
         (_perspective(camera, directions, pixels), _fisheye(camera, directions, pixels)), key=lambda pair: pair[0]
     )
     if not off <= _MOST_OFF:
         raise ValueError(
-            f"{told} cannot be told by k1 to k4, p1 and p2 (the closest such lens is off by {off:.2g} pixels); run "
+            f"{opening} cannot be told by k1 to k4, p1 and p2 (the closest such lens is off by {off:.2g} pixels); run "
             "colmap "
             "image_undistorter, which writes PINHOLE cameras"
         )
@@ -191,8 +191,8 @@ def _samples(camera: ColmapCamera) -> tuple[np.ndarray, np.ndarray]:
     inside = (pixels > 0).all(axis=-1) & (pixels < np.array([camera.width, camera.height])).all(axis=-1)
     outwards = np.linalg.norm(pixels - np.array(_split(camera, camera.model == "SIMPLE_DIVISION")[1]), axis=-1)
     growing = np.concatenate([np.ones((len(around), 1), dtype=bool), np.diff(outwards, axis=1) > 0], axis=1)
-    kept = np.logical_and.accumulate(inside & growing, axis=1)
-    return directions[kept], pixels[kept]
+    usable = np.logical_and.accumulate(inside & growing, axis=1)
+    return directions[usable], pixels[usable]
 
 
 def _perspective(camera: ColmapCamera, directions: np.ndarray, pixels: np.ndarray) -> tuple[float, ColmapLens]:
