@@ -120,9 +120,9 @@ def _unit_range(values: Tensor, name: str) -> Tensor:
 
 def _require_pinhole(cameras: Cameras) -> None:
     allowed = {kind.value for kind in _PINHOLE_AFTER_CACHING}
-    found = set(cameras.camera_type.reshape(-1).tolist()) - allowed
-    if found:
-        names = ", ".join(sorted(CameraType(kind).name for kind in found))
+    unsupported = set(cameras.camera_type.reshape(-1).tolist()) - allowed
+    if unsupported:
+        names = ", ".join(sorted(CameraType(kind).name for kind in unsupported))
         raise ValueError(
             f"cameras: expected pinhole cameras, got {names}; convert these images to perspective views first"
         )

@@ -226,9 +226,9 @@ class FillerbusterTrainer(Trainer):
         except torch.OutOfMemoryError:
             raise
         except (KeyError, RuntimeError) as error:
-            told = " ".join(str(error).split())[:200]
+            message = " ".join(str(error).split())[:200]
             raise Refused(
-                f"checkpoint {path}: it does not fit the options ({told}); give those of its run, see its config.yml"
+                f"checkpoint {path}: it does not fit the options ({message}); give those of its run, see its config.yml"
             ) from None
         finally:
             config.load_checkpoint, config.load_dir = given, folder

@@ -141,13 +141,13 @@ class CompletionPanel(ViewerControl):
                 if self.views is None
                 else {f"round_{number:02d}": self.views.of_round(number) for number in self.views.rounds}
             )
-            told = {name: (self.coverage.mode, *_told(views)) for name, views in rounds.items()}
-            for name in [name for name in self._drawn if self._drawn[name] != told.get(name)]:
+            states = {name: (self.coverage.mode, *_told(views)) for name, views in rounds.items()}
+            for name in [name for name in self._drawn if self._drawn[name] != states.get(name)]:
                 self._clear_round(name)
             for name, views in rounds.items():
                 if name not in self._drawn:
                     self._draw_round(name, views)
-                    self._drawn[name] = told[name]
+                    self._drawn[name] = states[name]
             if rounds:
                 self.coverage.offer_pictures()
             self._hidden &= set(rounds)

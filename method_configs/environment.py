@@ -35,8 +35,8 @@ def lacks() -> list[Lack]:
     """Everything that is missing on this machine; empty when all commands of this project and of nerfstudio can
     work.
     """
-    found = [_opencv(), _ffmpeg(), _libusb(), _compiler(), _cuda_toolkit()]
-    return [lack for lack in found if lack is not None]
+    checks = [_opencv(), _ffmpeg(), _libusb(), _compiler(), _cuda_toolkit()]
+    return [lack for lack in checks if lack is not None]
 
 
 def has_contrib() -> bool:

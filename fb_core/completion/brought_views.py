@@ -28,16 +28,16 @@ def takes_brought(config: CompletionConfig) -> bool:
 
 def announcement_of_brought(count: int, config: CompletionConfig) -> str:
     """One sentence on what becomes of them."""
-    told = f"The capture brings {count} generated view{'' if count == 1 else 's'} along"
+    announcement = f"The capture brings {count} generated view{'' if count == 1 else 's'} along"
     if not takes_brought(config):
-        return f"{told}: left out, only its photos count."
+        return f"{announcement}: left out, only its photos count."
     also = (
         "others are generated beside them"
         if config.on_completed_capture == "extend"
         else "none are generated beside them"
     )
     return (
-        f"{told}: trained on as such from step {config.at_step} on, never as photos; {also} "
+        f"{announcement}: trained on as such from step {config.at_step} on, never as photos; {also} "
         "(completion.on_completed_capture)."
     )
 
@@ -66,8 +66,8 @@ def brought_views(frames: Sequence[Frame], *, number: int, size: int | None = No
         cameras=Pinholes.cat(list(cameras)),
         origins=tuple(_origin(frame, number) for frame in frames),
         trust=None
-        if all(told is None for told, _ in trusts)
-        else torch.stack([whole if told is None else told for told, whole in trusts]),
+        if all(trust is None for trust, _ in trusts)
+        else torch.stack([whole if trust is None else trust for trust, whole in trusts]),
     )
 
 
@@ -83,15 +83,15 @@ def _fitted(
 def _trust(frame: Frame, side: int) -> tuple[UInt8[Tensor, "side side 1"] | None, UInt8[Tensor, "side side 1"]]:
     """The trust of each pixel where the frame names a picture of it that can be read, and that of the whole view."""
     whole = torch.full((side, side, 1), round(255 * _origin(frame, 0).trust), dtype=torch.uint8)
-    told = frame.extra.get(TRUST_KEY)
+    name = frame.extra.get(TRUST_KEY)
     root = frame.image_path.parent.parent
     if (
-        not isinstance(told, str)
-        or not (root / told).resolve().is_relative_to(root.resolve())
-        or not (root / told).is_file()
+        not isinstance(name, str)
+        or not (root / name).resolve().is_relative_to(root.resolve())
+        or not (root / name).is_file()
     ):
         return None, whole
-    picture = read_image(root / told)[:1]
+    picture = read_image(root / name)[:1]
     fit = SquareFit.of(picture.shape[1], picture.shape[2], side)
     fitted = fit.framed(resize(picture, fit.height, fit.width).clamp(0, 1))
     return (fitted * 255).round().to(torch.uint8).movedim(0, -1).contiguous(), whole

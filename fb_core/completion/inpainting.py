@@ -93,10 +93,10 @@ def run_inpainting(
     if done is not None and len(done):
         return
     (planned,) = plan.rounds
-    told, fitted = [], []
+    known_parts, fitted = [], []
     for view in context:  # pictures are large: one at a time
         given = _dilated(view.known, config.masked.dilate)
-        told.append(
+        known_parts.append(
             _Told(
                 whole=bool((given == 1).all()),
                 nothing=not bool((given == 1).any()),
@@ -104,15 +104,15 @@ def run_inpainting(
             )
         )
         fitted.append(fitted_view(dataclasses.replace(view, known=given), plan.size))
-    _refuse_nothing_to_do(told)
+    _refuse_nothing_to_do(known_parts)
     maker = RoundMaker(model=model, config=config, cache=open_cache(config), on_step=on_step, on_found=on_found)
     squares = maker.samples(Views.cat(fitted), planned).images
     origin = Origin(
         role=planned.role, round=planned.number, seed=planned.seed, prompt=planned.prompt, model_hash=model.model_hash
     )
-    largest = max(one.size[0] for one in told), max(one.size[1] for one in told)
+    largest = max(one.size[0] for one in known_parts), max(one.size[1] for one in known_parts)
     copies = []
-    for place in (place for place, one in enumerate(told) if not one.whole):
+    for place in (place for place, one in enumerate(known_parts) if not one.whole):
         view = context[place]
         image = pasted(view, squares[place].permute(2, 0, 1).float() / 255)
         supervised = _dilated(view.known, config.masked.dilate) < 1

@@ -72,9 +72,9 @@ class Curve:
 
         (Two independent guesses of one colour differ by the sum of their squared errors on average.)
         """
-        told = _filled(evidence.stacked.double(), self.usual)
+        signs = _filled(evidence.stacked.double(), self.usual)
         weights = torch.tensor(self.weights, dtype=torch.float64)
-        expected = weights[0] + torch.einsum("nchw,c->nhw", told, weights[1:])
+        expected = weights[0] + torch.einsum("nchw,c->nhw", signs, weights[1:])
         return expected.maximum(evidence.views.double().nan_to_num(0.0) / 2).maximum(
             evidence.spread.double().nan_to_num(0.0)
         )
@@ -114,8 +114,8 @@ def fitted_curve(
     matrix = (
         torch.cat([torch.ones(len(columns), 1, dtype=torch.float64), columns / scale], dim=1) * weight.sqrt()[:, None]
     )
-    found, _ = nnls(matrix.numpy(), (target * weight.sqrt()).numpy())
-    weights = torch.from_numpy(np.asarray(found))
+    solution, _ = nnls(matrix.numpy(), (target * weight.sqrt()).numpy())
+    weights = torch.from_numpy(np.asarray(solution))
     weights[1:] /= scale
     return Curve(weights=_numbers(weights), usual=_numbers(usual), baseline=baseline)
 
@@ -141,13 +141,13 @@ def evidence_of(
         spread: variance over samples, mean over the colours.
     """
     empty = torch.full_like(depth, torch.nan)
-    told = empty
+    difference = empty
     if shown is not None:
-        told = _nearby(
+        difference = _nearby(
             (images - shown).square().mean(dim=1), known if comparable is None else comparable, depth.shape[-1] / _NEAR
         )
     return Evidence(
-        known=told,
+        known=difference,
         views=disagreement(images, cameras, depth),
         spread=empty if spread is None else spread,
         distance=angle_to_known(known, cameras),

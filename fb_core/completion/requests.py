@@ -199,7 +199,7 @@ def plan_request(
             seed, prompt = request.seed + (request.seed == origin.seed), request.prompt
     nearest = role == REQUESTED or (role == DENSIFY and config.context_choice == "overlap")
     context = nearest_context(cameras, new, scene.shell, config.context_views, known) if nearest else scene.context
-    kept = [] if bank is None else [index for index in range(len(bank)) if index not in set(replaces)]
+    remaining = [] if bank is None else [index for index in range(len(bank)) if index not in set(replaces)]
     planned = PlannedRound(number=number, role=role, seed=seed, prompt=prompt, cameras=new, aspect=aspect)
     plan = CompletionPlan(
         shape=scene.shape,
@@ -209,7 +209,9 @@ def plan_request(
         rounds=(planned,),
         size=size,
     )
-    return PlannedRequest(plan=plan, replaces=replaces, done=bank[kept] if bank is not None and kept else None)
+    return PlannedRequest(
+        plan=plan, replaces=replaces, done=bank[remaining] if bank is not None and remaining else None
+    )
 
 
 def fan_from(request: CompleteFrom, scene: CompletionPlan, *, focal: float, size: int) -> Pinholes:
@@ -241,8 +243,8 @@ def fan_from(request: CompleteFrom, scene: CompletionPlan, *, focal: float, size
 def key_of(views: CompletedViews, index: int) -> str:
     """A name for a generated view that stays while others come and go, and ends when it is generated anew."""
     origin, camera = views.origins[index], views.cameras.camera_to_world[index]
-    told = f"{origin.role} {origin.round} {origin.seed} {origin.model_hash} {camera.double().cpu().tolist()}"
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    identity = f"{origin.role} {origin.round} {origin.seed} {origin.model_hash} {camera.double().cpu().tolist()}"
+    return hashlib.sha256(identity.encode()).hexdigest()[:16]
 
 
 def place_of(bank: CompletedViews | None, key: str) -> int | None:

@@ -128,23 +128,23 @@ def draw(
 
     Raises ValueError as the model does.
     """
-    found, keys = dict[int, Tensor](), dict[int, str]()
+    pictures, keys = dict[int, Tensor](), dict[int, str]()
     seeds = question.seeds(samples)
     if cache is not None:
-        told = {"sampling": question.sampling, "model_hash": model.model_hash, "current": question.current}
+        settings = {"sampling": question.sampling, "model_hash": model.model_hash, "current": question.current}
         for seed in seeds:
-            keys[seed] = round_key(question.sequence, seed=seed, prompt=question.prompt or "", **told)
-            kept = cache.find(keys[seed], views=question.views, size=question.sequence.size[0])
-            if kept is not None:
-                found[seed] = kept
-    missing = [seed for seed in seeds if seed not in found]
+            keys[seed] = round_key(question.sequence, seed=seed, prompt=question.prompt or "", **settings)
+            cached = cache.find(keys[seed], views=question.views, size=question.sequence.size[0])
+            if cached is not None:
+                pictures[seed] = cached
+    missing = [seed for seed in seeds if seed not in pictures]
     if not missing and on_found is not None:
         on_found()
     for seed, filled in zip(missing, _drawn(question, model, missing, on_step), strict=True):
-        found[seed] = in_8_bits(filled.images[-question.views :])
+        pictures[seed] = in_8_bits(filled.images[-question.views :])
         if cache is not None:
-            cache.keep(keys[seed], found[seed])
-    return made_of([found[seed] for seed in seeds])
+            cache.keep(keys[seed], pictures[seed])
+    return made_of([pictures[seed] for seed in seeds])
 
 
 def _drawn(

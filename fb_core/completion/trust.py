@@ -54,14 +54,14 @@ class Trust:
 
     def state(self) -> dict[str, Any]:
         """Numbers and lists alone, for checkpoints and reports; what is not known is None."""
-        told = {name: getattr(self, name) for name in ("model", "mean", "nearest", "splats")}
-        told = {name: value if math.isfinite(value) else None for name, value in told.items()}
+        errors = {name: getattr(self, name) for name in ("model", "mean", "nearest", "splats")}
+        errors = {name: value if math.isfinite(value) else None for name, value in errors.items()}
         curve = (
             None
             if self.curve is None
             else {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self.curve).items()}
         )
-        return {"hidden": self.hidden, **told, "curve": curve}
+        return {"hidden": self.hidden, **errors, "curve": curve}
 
     @staticmethod
     def from_state(state: dict[str, Any]) -> Trust:
@@ -70,10 +70,14 @@ class Trust:
             name: math.nan if state[name] is None else float(state[name])
             for name in ("model", "mean", "nearest", "splats")
         }
-        told = state["curve"]
+        curve_state = state["curve"]
         curve = None
-        if told is not None:
-            curve = Curve(weights=tuple(told["weights"]), usual=tuple(told["usual"]), baseline=float(told["baseline"]))
+        if curve_state is not None:
+            curve = Curve(
+                weights=tuple(curve_state["weights"]),
+                usual=tuple(curve_state["usual"]),
+                baseline=float(curve_state["baseline"]),
+            )
         return Trust(hidden=int(state["hidden"]), curve=curve, **errors)
 
     @staticmethod
@@ -106,14 +110,15 @@ class Trust:
         )
         if math.isfinite(self.splats):
             against += f", {_decibels(self.splats, self.model)} than the splats' render (trained on these photos)"
-        told = (
+        words = (
             f"On {self.hidden} hidden views of your capture the model is {against}: its views count "
             f"{self.value:.2f} of a photo."
         )
         if self.value > LEAST:
-            return told
+            return words
         return (
-            f"{told} It knows no scenes like this one; a model that does (fillerbuster convert, train) fills it better."
+            f"{words} It knows no scenes like this one; a model that does (fillerbuster convert, train) fills it "
+            "better."
         )
 
 
@@ -165,24 +170,26 @@ def measured_trust(
     )
     drawn = _generated(trial.asked, model, config, cache, on_step)
     images = _as_kept(drawn.images).to(truth.images)
-    told, hidden = truth[list(range(len(others)))], truth[list(range(len(others), len(truth)))]
+    known_views, hidden = truth[list(range(len(others)))], truth[list(range(len(others), len(truth)))]
     known = (hidden.image_known >= 1) & ~trial.gone[
         len(others) :, None
     ]  # parts that no view shows are another question
     known = (known if bool(known.any()) else hidden.image_known >= 1).to(images)
-    mean = (told.images * told.image_known).sum(dim=(0, 2, 3)) / told.image_known.sum().clamp(min=1)
-    nearest = told.images[
+    mean = (known_views.images * known_views.image_known).sum(dim=(0, 2, 3)) / known_views.image_known.sum().clamp(
+        min=1
+    )
+    nearest = known_views.images[
         [_nearest(context[place].camera, [context[other].camera for other in others]) for place in places]
     ]
     splats = None if trial.seen is None or trial.seen.colors is None else trial.seen.colors[len(others) :]
-    found = Trust(
+    trust = Trust(
         hidden=count,
         model=_error(images[len(others) :], hidden.images, known),
         mean=_error(mean[None, :, None, None].expand_as(hidden.images), hidden.images, known),
         nearest=_error(nearest, hidden.images, known),
         splats=math.nan if splats is None else _error(splats, hidden.images, known),
     )
-    return dataclasses.replace(found, curve=_curve(trial, drawn, baseline=min(found.mean, found.nearest)))
+    return dataclasses.replace(trust, curve=_curve(trial, drawn, baseline=min(trust.mean, trust.nearest)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,7 +96,7 @@ def readable_captures(folders: Sequence[Path], *, views: int) -> list[tuple[str,
 
     Raises ValueError if none is left.
     """
-    kept, reasons = [], []
+    captures, reasons = [], []
     for folder in folders:
         try:
             capture = read_training_capture(folder)
@@ -108,15 +108,15 @@ def readable_captures(folders: Sequence[Path], *, views: int) -> list[tuple[str,
                 f"capture {folder} has {len(capture.frames)} frames, fewer than the {views} views of a sequence"
             )
         else:
-            kept.append((folder.name, capture))
-    if not kept:
+            captures.append((folder.name, capture))
+    if not captures:
         raise ValueError(
             f"captures: none can be asked for sequences of {views} views ({reasons[0]}); ask for fewer views, or give "
             "others"
         )
     for reason in reasons:
         _logger.warning("left out: %s", reason)
-    return kept
+    return captures
 
 
 class ScaledPictures:
@@ -135,10 +135,10 @@ class ScaledPictures:
             self._kept[key] = window.scaled()
             self._bytes += _bytes(self._kept[key])
         self._kept.move_to_end(key)
-        found = self._kept[key]
+        scaled = self._kept[key]
         while self._bytes > self._most_bytes:
             self._bytes -= _bytes(self._kept.popitem(last=False)[1])
-        return window.cut_from(*found)
+        return window.cut_from(*scaled)
 
 
 def _bytes(pair: tuple[Tensor, Tensor]) -> int:

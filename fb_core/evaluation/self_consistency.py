@@ -73,6 +73,8 @@ def self_consistency(
         )
         for number, (image, camera) in enumerate(zip(images, cameras, strict=True))
     ]
-    found = register(photos, method=method, model=model, seed=seed, sampling=sampling, views_at_once=views_at_once)
-    trusted = sum(verdict == "ok" for verdict in found.verdicts) / len(photos)
-    return pose_errors(found.cameras, list(cameras)) | {"trusted_share": trusted}
+    registration = register(
+        photos, method=method, model=model, seed=seed, sampling=sampling, views_at_once=views_at_once
+    )
+    trusted = sum(verdict == "ok" for verdict in registration.verdicts) / len(photos)
+    return pose_errors(registration.cameras, list(cameras)) | {"trusted_share": trusted}

@@ -97,8 +97,8 @@ def evaluate_uncalibrated(
         answers |= {f"features at {side}": _by_features(task, number, side, model.size) for side in task.sides}
         answers["model"] = _by_model(model, scene, seed)
         for method, answer in answers.items():
-            told = {"trusted_share": answer.trusted_share, "cpu_seconds": answer.cpu_seconds}
-            outcome["cameras", method] = pose_errors(answer.cameras, truth) | told
+            measures = {"trusted_share": answer.trusted_share, "cpu_seconds": answer.cpu_seconds}
+            outcome["cameras", method] = pose_errors(answer.cameras, truth) | measures
             generated = None if method == "identity" else _fly_through(model, scene, answer.cameras, seed)
             outcome["fly-through", method] = {"psnr": math.nan if generated is None else _psnr(generated, scene)}
         best = _fly_through(model, scene, truth, seed)
@@ -127,18 +127,18 @@ def evaluate_capture(
         )
     rows: list[dict[str, Any]] = []
     for method in ("features", "model"):
-        for told in (True, False):
-            name = f"{method}, focal length {'told' if told else 'unknown'}"
+        for focal_known in (True, False):
+            name = f"{method}, focal length {'told' if focal_known else 'unknown'}"
             on_method(name)
             hidden = [
-                dataclasses.replace(photo, camera=None, focal_prior=photo.focal_prior if told else None)
+                dataclasses.replace(photo, camera=None, focal_prior=photo.focal_prior if focal_known else None)
                 for photo in photos
             ]
             began = time.process_time()
-            found = register(hidden, method=method, model=model if method == "model" else None, seed=seed)
+            registration = register(hidden, method=method, model=model if method == "model" else None, seed=seed)
             seconds = time.process_time() - began
-            trusted = sum(verdict == "ok" for verdict in found.verdicts) / len(photos)
-            row = pose_errors(found.cameras, truth) | {"trusted_share": trusted, "cpu_seconds": seconds}
+            trusted = sum(verdict == "ok" for verdict in registration.verdicts) / len(photos)
+            row = pose_errors(registration.cameras, truth) | {"trusted_share": trusted, "cpu_seconds": seconds}
             rows.append({"part": f"{len(photos)} photos of a capture", "method": name} | row)
     return rows
 
@@ -206,12 +206,12 @@ def _registered(
 ) -> _Answer:
     photos = [photo_of(image, name=f"view {index}", device="one") for index, image in enumerate(images)]
     began = time.process_time()
-    found = register(photos, method=method, model=model, seed=seed)
+    registration = register(photos, method=method, model=model, seed=seed)
     seconds = time.process_time() - began
-    cameras = [None if camera is None else camera.scaled(size, size) for camera in found.cameras]
+    cameras = [None if camera is None else camera.scaled(size, size) for camera in registration.cameras]
     return _Answer(
         cameras=cameras,
-        trusted_share=sum(verdict == "ok" for verdict in found.verdicts) / len(photos),
+        trusted_share=sum(verdict == "ok" for verdict in registration.verdicts) / len(photos),
         cpu_seconds=seconds,
     )
 

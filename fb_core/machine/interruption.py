@@ -91,12 +91,12 @@ def _again(number: int) -> None:
 
 def _importer(frame: FrameType | None) -> FrameType | None:
     """The frame whose code has begun the outermost import that is under way; None outside of imports."""
-    found = None
+    importer = None
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            found = frame.f_back
+            importer = frame.f_back
         frame = frame.f_back
-    return found
+    return importer
 
 
 def _call_after_import(importer: FrameType, call: Callable[[], object]) -> None:

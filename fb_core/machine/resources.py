@@ -56,8 +56,8 @@ def peak_memory_bytes() -> int:
 def _machine_free(root: Path) -> int | None:
     """Of the whole machine: Linux's own estimate, elsewhere psutil's if it is installed."""
     for line in _text(root / "proc/meminfo").splitlines():
-        name, _, told = line.partition(":")
-        available = _whole(told.split()[0]) if name == "MemAvailable" and told.split() else None
+        name, _, amount = line.partition(":")
+        available = _whole(amount.split()[0]) if name == "MemAvailable" and amount.split() else None
         if available is not None:
             return _KIB * available
     try:
@@ -73,8 +73,8 @@ def _groups(root: Path) -> Iterator[Path]:
     """
     paths = dict[str, str]()  # of this process, by the list of controllers; "" is version 2
     for line in _text(root / "proc/self/cgroup").splitlines():
-        _, _, told = line.partition(":")
-        controllers, _, path = told.partition(":")
+        _, _, hierarchy = line.partition(":")
+        controllers, _, path = hierarchy.partition(":")
         paths |= {name: path for name in controllers.split(",")}
     for line in _text(root / "proc/self/mountinfo").splitlines():
         fields, _, rest = line.partition(" - ")

@@ -166,6 +166,6 @@ class Denoising:
             )
         if self.current is not None and self.counts is not None and self._from_noise_too:
             for share in self._shares:
-                told = (self.counts == share).to(self.counts)
-                field = imposed(field, self.current, self.noise, told, until=sampling.joins_at(share))
+                mask = (self.counts == share).to(self.counts)
+                field = imposed(field, self.current, self.noise, mask, until=sampling.joins_at(share))
         return field

@@ -54,9 +54,9 @@ class KeptBatches:
         if not path.exists():
             self._make(number)
         with safe_open(path, framework="pt") as file:
-            kept = {name: file.get_tensor(name).float() for name in file.keys()}
-        conditioning = Conditioning(channels=kept["channels"], frames=kept["frames"])
-        return Kept(Encoded(kept["data"], conditioning, None, None, None), kept.get("log_distance"))
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+        conditioning = Conditioning(channels=tensors["channels"], frames=tensors["frames"])
+        return Kept(Encoded(tensors["data"], conditioning, None, None, None), tensors.get("log_distance"))
 
     def make(self, steps: int) -> None:
         """Encode what so many steps need and what is missing, so that trainings may be timed."""

@@ -184,10 +184,10 @@ def seen_by_nobody_else(
     """
     points = means.detach().to("cpu", torch.float64)
     nearby = [camera.to("cpu", torch.float64) for camera in captured]
-    kept = seen_by(nearby, points, known)
+    seen = seen_by(nearby, points, known)
     if staying is not None:
-        kept |= _supervised(staying, points)
-    return _supervised(leaving, points) & ~kept
+        seen |= _supervised(staying, points)
+    return _supervised(leaving, points) & ~seen
 
 
 def _supervised(views: CompletedViews, points: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:

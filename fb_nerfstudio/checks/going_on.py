@@ -130,9 +130,9 @@ def parsed(datamanager: Any) -> DataparserOutputs:
     try:
         outputs = without_open3d(parser).setup().get_dataparser_outputs(split="train")
     except Exception as error:  # whatever a dataparser of nerfstudio's raises
-        told = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError(
-            f"data {data}: {type(parser).__name__} cannot read it ({told}); mend the data or the dataparser's options"
+            f"data {data}: {type(parser).__name__} cannot read it ({reason}); mend the data or the dataparser's options"
         ) from None
     if len(outputs.image_filenames) == 0:
         raise ValueError(f"data {data}: the dataparser's options leave no photo to train on; change the split")
@@ -173,9 +173,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        told = " ".join(str(error).split())[:200]
+        message = " ".join(str(error).split())[:200]
         raise ValueError(
-            f"checkpoint {path}: not readable as plain values ({told}); give one that ns-train has saved"
+            f"checkpoint {path}: not readable as plain values ({message}); give one that ns-train has saved"
         ) from None
     parts = ("pipeline", "optimizers", "scalers") if isinstance(state, dict) else ()
     if (
@@ -244,8 +244,10 @@ def check_shapes(config: Any, path: Path, state: dict[str, Any], photos: int) ->
         )
     x, y, w = model.grid_shape
     if grids is not None and grids[2:] != (w, y, x):
-        told = " ".join(str(side) for side in reversed(grids[2:]))
-        raise fails(f"has bilateral grids of {told}, got {x} {y} {w}", f"give --pipeline.model.grid-shape {told}")
-    for name, found in {"a camera optimizer": corrections, "bilateral grids": grids}.items():
-        if found is not None and found[0] != photos:
-            raise fails(f"was trained with {name} for {found[0]} photos, here are {photos}", "give its own --data")
+        shape_then = " ".join(str(side) for side in reversed(grids[2:]))
+        raise fails(
+            f"has bilateral grids of {shape_then}, got {x} {y} {w}", f"give --pipeline.model.grid-shape {shape_then}"
+        )
+    for name, saved in {"a camera optimizer": corrections, "bilateral grids": grids}.items():
+        if saved is not None and saved[0] != photos:
+            raise fails(f"was trained with {name} for {saved[0]} photos, here are {photos}", "give its own --data")

@@ -39,14 +39,14 @@ class Rounds:
     def after(self, plan: CompletionPlan, *, step: int, due: int) -> Rounds:
         """When the planned round has been generated at a step."""
         covered = (None, None) if plan.covered is None else plan.covered
-        told = {
+        entry = {
             "round": self.number,
             "step": step,
             "views": plan.new_views,
             "seen_before": covered[0],
             "seen_after": covered[1],
         }
-        return Rounds(number=self.number + 1, due=due, record=(*self.record, told))
+        return Rounds(number=self.number + 1, due=due, record=(*self.record, entry))
 
     def state(self) -> dict[str, Any]:
         """Plain values."""

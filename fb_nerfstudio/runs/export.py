@@ -91,8 +91,10 @@ def _captured_frame(frame: Frame, target: Path, *, masked: bool, held_out: bool)
     if masked and mask is not None:
         mask_path = _mask_path(target)
         media.write_image(mask_path, mask)
-    kept = {key: value for key, value in frame.extra.items() if not key.endswith("_path") and key not in _LENS_EXTRAS}
-    extra = {**kept, "generated": False, "held_out": held_out}
+    carried = {
+        key: value for key, value in frame.extra.items() if not key.endswith("_path") and key not in _LENS_EXTRAS
+    }
+    extra = {**carried, "generated": False, "held_out": held_out}
     return Frame(image_path=target, mask_path=mask_path, camera=camera, camera_model=_MODEL, extra=extra)
 
 
@@ -172,5 +174,5 @@ def _write_colmap(folder: Path, capture: Capture, frames: list[Frame], points: P
         (folder / f"{split}_list.txt").write_text(
             "".join(f"{frame.image_path.name}\n" for frame in chosen), encoding="utf-8"
         )
-    told = {frame.image_path.name: frame.extra for frame in frames}
-    (folder / PROVENANCE_NAME).write_text(json.dumps(told, indent=1, allow_nan=False), encoding="utf-8")
+    provenance = {frame.image_path.name: frame.extra for frame in frames}
+    (folder / PROVENANCE_NAME).write_text(json.dumps(provenance, indent=1, allow_nan=False), encoding="utf-8")

@@ -83,14 +83,14 @@ def render_held_out(run: Path, capture: Path, *, on_view: Callable[[int, int], N
 
 def _verdicts(capture: Path, names: list[str]) -> list[bool]:
     """Whether each of these pictures of the capture is covered."""
-    told = {frame.image_path.name: frame.extra.get("covered") for frame in read_capture(capture).frames}
-    unsaid = [name for name in names if told.get(name) is None]
+    covered = {frame.image_path.name: frame.extra.get("covered") for frame in read_capture(capture).frames}
+    unsaid = [name for name in names if covered.get(name) is None]
     if unsaid:
         raise ValueError(
             f"{capture}: held-out view {unsaid[0]} does not say whether it is 'covered'; make the capture with "
             "fillerbuster rooms"
         )
-    return [bool(told[name]) for name in names]
+    return [bool(covered[name]) for name in names]
 
 
 def _pictures(bank: CompletedViews) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:

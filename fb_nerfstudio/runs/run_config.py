@@ -108,10 +108,10 @@ def _named(tag: str, name: str) -> type:
     module = EARLIER_NAMES.get(module, module)
     if own not in ALLOWED.get(module, ()):
         raise _Refused(f"the tag {tag!r} names what is no part of a fillerbuster run")
-    found = vars(importlib.import_module(module)).get(own)
-    if not isinstance(found, type):
+    kind = vars(importlib.import_module(module)).get(own)
+    if not isinstance(kind, type):
         raise _Refused(f"the tag {tag!r} names no class that this version knows")
-    return found
+    return kind
 
 
 def _class(loader: _Loader, name: str, node: yaml.Node) -> type:

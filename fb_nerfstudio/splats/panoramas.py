@@ -102,7 +102,7 @@ def _along(
     right, up, back = (directions @ face.T).unbind(dim=-1)
     ahead = -back
     places = torch.stack([right / ahead, -up / ahead], dim=-1) / _OVERLAP
-    found: dict[str, Tensor] = {}
+    sampled: dict[str, Tensor] = {}
     for name, picture in drawn.items():
         channels = picture.expand(side, side, picture.shape[-1]).movedim(-1, 0)[None]
         values = F.grid_sample(
@@ -112,5 +112,5 @@ def _along(
             values = values / ahead[:, None]
         elif name.endswith("normal"):
             values = ((2 * values - 1) @ face.to(values) + 1) / 2  # right, up, towards the camera: the face's own axes
-        found[name] = values
-    return found
+        sampled[name] = values
+    return sampled

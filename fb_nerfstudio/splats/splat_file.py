@@ -54,14 +54,14 @@ class Splats:
         given = {name: values.detach().to("cpu", torch.float32) for name, values in parameters.items()}
         constant = given["features_dc"] if sh_degree > 0 else RGB2SH(given["features_dc"].sigmoid())
         harmonics = torch.cat([constant[:, None], given["features_rest"].reshape(len(constant), -1, 3)], dim=1)
-        found = Splats(
+        splats = Splats(
             means=given["means"],
             log_scales=given["scales"],
             quats=given["quats"],
             logits=given["opacities"].reshape(-1),
             harmonics=harmonics[:, : (sh_degree + 1) ** 2],
         )
-        return found.chosen(_table(found).isfinite().all(dim=1))
+        return splats.chosen(_table(splats).isfinite().all(dim=1))
 
     def to(self, device: torch.device | str) -> Splats:
         """The same on another device."""

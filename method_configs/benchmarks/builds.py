@@ -79,27 +79,27 @@ class Builds(TableFiles):
     def _rows(self, folder: Path, builds: tuple[_Build, ...], known: int, unknown: int) -> list[dict[str, Any]]:
         """The builds' figures for one case, this one's with its gain over the other one."""
         _logger.info("%d known and %d unknown views in %d rooms", known, unknown, self.rooms)
-        found: dict[str, list[dict[str, float]]] = {build.name: [] for build in builds}
+        results: dict[str, list[dict[str, float]]] = {build.name: [] for build in builds}
         for number in range(self.rooms):
             stored, truth = _stored_views(folder, known, unknown, seed=self.seed, number=number)
             for build in builds:
-                found[build.name].append(build.complete(stored, truth, known, seed=self.seed + number))
-        return [self._row(build, found, builds[-1].name, f"{known}+{unknown}") for build in builds]
+                results[build.name].append(build.complete(stored, truth, known, seed=self.seed + number))
+        return [self._row(build, results, builds[-1].name, f"{known}+{unknown}") for build in builds]
 
     def _training_rows(self, this: _Build, other: _Build) -> list[dict[str, Any]]:
         """Both builds' training steps; the loss is a running mean over all of them."""
         from fb_core.evaluation.results import commit
 
         _logger.info("%d training steps", self.training_steps)
-        found = [(this.trained(), other.trained()) for _ in range(self.training_steps)]
+        pairs = [(this.trained(), other.trained()) for _ in range(self.training_steps)]
         return [
             {
                 "part": "a training step", "build": f"{build.name} ({commit(build.root)})",
                 "steps": self.training_steps,
-                "cpu_seconds": median(pair[number]["cpu_seconds"] for pair in found),
-                "seconds": median(pair[number]["seconds"] for pair in found),
-                "times_as_fast": median(pair[1]["cpu_seconds"] / pair[number]["cpu_seconds"] for pair in found),
-                "loss": found[-1][number]["loss"],
+                "cpu_seconds": median(pair[number]["cpu_seconds"] for pair in pairs),
+                "seconds": median(pair[number]["seconds"] for pair in pairs),
+                "times_as_fast": median(pair[1]["cpu_seconds"] / pair[number]["cpu_seconds"] for pair in pairs),
+                "loss": pairs[-1][number]["loss"],
             }
             for number, build in enumerate((this, other))
         ]  # fmt: skip

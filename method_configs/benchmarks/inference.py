@@ -128,8 +128,8 @@ class Inference(TableFiles):
             timed(model, *first, 1, self.seed, clock)  # what is set up at first use
             return {str(count): timed(model, cell.views, cell.size, count, self.seed, clock) for count in counts}
 
-        kept = self.kept(f"{_weights(model)}/{cell.size}-{cell.views}".replace(" ", "-"), asked, measure)
-        return {int(count): value for count, value in kept.items()}
+        seconds = self.kept(f"{_weights(model)}/{cell.size}-{cell.views}".replace(" ", "-"), asked, measure)
+        return {int(count): value for count, value in seconds.items()}
 
     def _rows(
         self, model: Fillerbuster, cell: Cell, measured: dict[Cell, dict[int, float]], reckoned: bool

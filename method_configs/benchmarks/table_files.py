@@ -125,8 +125,8 @@ def origin_of(report: Report, command: str = "") -> str:
     from method_configs.benchmarks.command import command_line
 
     models = sorted({row["model"] for row in report.rows if row.get("model", "-") != "-"})
-    told = f"model {', '.join(models)}, " if models else ""
-    return f"{command or command_line()}, {told}commit {commit()}, seed {report.seed}, {hardware()}"
+    model_part = f"model {', '.join(models)}, " if models else ""
+    return f"{command or command_line()}, {model_part}commit {commit()}, seed {report.seed}, {hardware()}"
 
 
 def _line(cells: Any) -> str:

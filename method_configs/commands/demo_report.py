@@ -46,7 +46,7 @@ def write_report(output: Path, views: dict[str, HeldOutViews], quality: dict[str
             heading="Held-out cameras, ground truth", pictures=[views["with"].truth[i] for i in chosen], captions=kinds
         )
     )
-    told = "; ".join(
+    summary = "; ".join(
         f"{kind} views: {quality['without'][kind]['psnr']:.1f} → {quality['with'][kind]['psnr']:.1f} dB, "
         f"holes {100 * quality['without'][kind]['hole_share']:.0f} → {100 * quality['with'][kind]['hole_share']:.0f} %"
         for kind in ("uncovered", "covered")
@@ -56,7 +56,7 @@ def write_report(output: Path, views: dict[str, HeldOutViews], quality: dict[str
         output / "report.png",
         strips,
         title=title,
-        subtitle=f"{told} (held-out, without → with completion)",
+        subtitle=f"{summary} (held-out, without → with completion)",
         columns=COLUMNS,
     )
 

@@ -116,8 +116,8 @@ def _measured(
     measured: dict[Path, list[dict[str, float]]] = {}
     for folder in folders:
         path = folder / "measured.json"
-        if path.exists() and (kept := json_format.loads(path.read_text()))["asked"] == decides[folder]:
-            measured[folder] = kept["rows"]
+        if path.exists() and (stored := json_format.loads(path.read_text()))["asked"] == decides[folder]:
+            measured[folder] = stored["rows"]
     missing = {
         folder: dataclasses.replace(recipe, seed=seed) for folder, recipe in folders.items() if folder not in measured
     }

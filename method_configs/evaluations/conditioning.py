@@ -69,14 +69,14 @@ class Conditioning(TableFiles):
         for known, number in track(cells, description="sequences", transient=True):
             scores[known].append(self._scores(model, sequences[number], known, number, sampling))
         report = Report(seed=self.seed)
-        for known, found in scores.items():
+        for known, rows in scores.items():
             row: dict[str, Any] = {
                 "part": f"{self.hidden} hidden views of {self.data.name}",
                 "known": known,
                 "model": model.model_hash[:8],
             }
             for metric in ("psnr", "ssim"):
-                row[metric], row[f"{metric}_interval"] = interval([one[metric] for one in found])
+                row[metric], row[f"{metric}_interval"] = interval([one[metric] for one in rows])
             report.rows.append(row)
         self.publish(report, draw)
         if self.sheet is not None:

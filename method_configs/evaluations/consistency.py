@@ -68,12 +68,12 @@ class Consistency(TableFiles):
         poses: dict[str, str] = {}
         part = f"RRA: {self.pairs} pairs within a second of {self.fps:g} frames, {self._matcher}, {self.size} pixels"
         for run in self.runs:
-            found = self._judged(run, matcher, poses)
-            for method, pairs in found["pairs"].items():
-                key = (method, found["capture"])
+            result = self._judged(run, matcher, poses)
+            for method, pairs in result["pairs"].items():
+                key = (method, result["capture"])
                 if key not in judged:  # of two runs of one method on one capture the first is told
                     judged[key] = [PairResult(**values) for values in pairs]
-                    model = found["model"] if method == found["method"] else "-"
+                    model = result["model"] if method == result["method"] else "-"
                     report.rows.append(
                         {"part": part, "method": method, "capture": key[1], "model": model} | accuracy(judged[key])
                     )
@@ -125,8 +125,8 @@ class Consistency(TableFiles):
         )
         del state
         file = f"{method}-{name}-{_digest(asked['run'])}"
-        found = self.kept(file, asked, lambda: self._measured(run, method, capture, matcher, with_truth))
-        return found | {"capture": name, "method": method}
+        result = self.kept(file, asked, lambda: self._measured(run, method, capture, matcher, with_truth))
+        return result | {"capture": name, "method": method}
 
     def _measured(self, run: Path, method: str, capture: Path, matcher: Matcher, with_truth: bool) -> dict[str, Any]:
         from fb_core.evaluation.metrics.relative_rotation import frame_pairs
@@ -143,7 +143,7 @@ class Consistency(TableFiles):
             films |= true_films(capture, pipeline, captured, films[method], seed=self.seed, controls=self.controls)
         judged = {name: self._judge(film, matcher, f"{name}: pair") for name, film in films.items()}
         return {
-            "pairs": {name: [dataclasses.asdict(pair) for pair in found] for name, found in judged.items()},
+            "pairs": {name: [dataclasses.asdict(pair) for pair in results] for name, results in judged.items()},
             "model": "-" if bank is None or not len(bank) else bank.origins[0].model_hash[:8],
         }
 
@@ -259,7 +259,7 @@ def draw(report: Report, judged: dict[tuple[str, str], list[PairResult]], path: 
     figure, axes = new_axes("share of pairs with a smaller error")
     limits = np.geomspace(0.1, _CURVE_DEGREES, 200)
     for method in dict.fromkeys(method for method, _ in judged):
-        errors = np.array([one.error_degrees for key, found in judged.items() if key[0] == method for one in found])
+        errors = np.array([one.error_degrees for key, results in judged.items() if key[0] == method for one in results])
         axes.plot(limits, [(errors < limit).mean() for limit in limits], label=f"{method} ({len(errors)} pairs)")
     axes.set_xscale("log")
     axes.set_ylim(0, 1.02)

@@ -247,8 +247,8 @@ def agreement(pipeline: Any, bank: Any, lpips: Path | None) -> dict[str, float]:
             for name, metric in metrics.items():
                 values.setdefault(name, []).append(float(metric(render, picture).mean()))
     row: dict[str, float] = {}
-    for name, found in values.items():
-        row[name], row[f"{name}_interval"] = interval(found)
+    for name, per_view in values.items():
+        row[name], row[f"{name}_interval"] = interval(per_view)
     return row
 
 

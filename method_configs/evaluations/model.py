@@ -101,8 +101,8 @@ class ModelOnCaptures(TableFiles):
         ]
         scores: dict[tuple[str, int], list[dict[str, float]]] = {}
         for name, length, number in track(cells, description="sequences", transient=True):
-            found = self._scores(models[name], size, length, number, question, distance)
-            scores.setdefault((name, length), []).append(found)
+            row = self._scores(models[name], size, length, number, question, distance)
+            scores.setdefault((name, length), []).append(row)
         report = Report(seed=self.seed, rows=[*self._rows(scores, models, size), *paper_rows(self.lengths)])
         self.publish(report, draw)
 
@@ -170,7 +170,7 @@ class ModelOnCaptures(TableFiles):
 
         where = f"{self.family} rooms" if self.data is None else self.data.name
         rows = []
-        for (name, length), found in scores.items():
+        for (name, length), per_sequence in scores.items():
             row: dict[str, Any] = {
                 "part": f"{where}, {size} pixels, {self.sequences} sequences",
                 "method": name,
@@ -178,8 +178,8 @@ class ModelOnCaptures(TableFiles):
             }
             row["model"] = models[name].model_hash[:8]
             for metric in METRICS:
-                if metric in found[0]:
-                    row[metric], row[f"{metric}_interval"] = interval([one[metric] for one in found])
+                if metric in per_sequence[0]:
+                    row[metric], row[f"{metric}_interval"] = interval([one[metric] for one in per_sequence])
             rows.append(row)
         return rows
 

@@ -76,7 +76,7 @@ class Rooms:
         completer = Fillerbuster.from_pretrained(self.model)
         task = CompletionTask(rooms=self.rooms, views=self.views, known=self.known, family=self.family, seed=self.seed)
         recommended = completer.recommended_sampling
-        told = recommended.guess != "start"  # a model that was trained to be told a guess also is
+        takes_guess = recommended.guess != "start"  # a model that was trained to be told a guess also is
         report, results = Report(seed=self.seed), list[RoomResult]()
         for scale, steps in itertools.product(
             self.guidance or (recommended.guidance_unknown,), self.steps or (recommended.steps,)
@@ -84,12 +84,12 @@ class Rooms:
             sampling = dataclasses.replace(recommended, guidance_unknown=scale, steps=steps)
             began = time.process_time()
             iterator = evaluate_completion(
-                completer, task, sampling, strengths=self.strengths, samples=self.samples, told=told
+                completer, task, sampling, strengths=self.strengths, samples=self.samples, told=takes_guess
             )
             results = list(
                 track(iterator, description=f"guidance {scale:g}, {steps} steps", total=self.rooms, transient=True)
             )
-            seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths) + told)
+            seconds = (time.process_time() - began) / self.rooms / (self.samples + len(self.strengths) + takes_guess)
             drawn = {mean_of(self.samples): 1.0, likeliest_of(self.samples): 1.0}
             times = {"model": 1.0, TOLD: 1.0, **drawn} | {started_at(strength): strength for strength in self.strengths}
             mine = {"guidance": scale, "steps": sampling.steps, "cpu_seconds_per_room": seconds}

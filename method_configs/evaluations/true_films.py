@@ -163,8 +163,8 @@ def true_pictures(
     from fb_core.geometry.similarity import Similarity
 
     content = read_capture(capture)
-    told = content.extra.get("room")
-    if not isinstance(told, dict) or told.get("family") not in FAMILIES or not isinstance(told.get("seed"), int):
+    record = content.extra.get("room")
+    if not isinstance(record, dict) or record.get("family") not in FAMILIES or not isinstance(record.get("seed"), int):
         return None
     places = {frame.image_path.name: frame.camera for frame in content.frames}
     names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
@@ -172,7 +172,7 @@ def true_pictures(
         return None
     theirs = [(torch.cat([one.rotations for one in side]), torch.cat([one.centers for one in side])) for side in
               (captured, [places[name] for name in names])]  # fmt: skip
-    to_capture, room = Similarity.between(*theirs), make_room(told["seed"], FAMILIES[told["family"]])
+    to_capture, room = Similarity.between(*theirs), make_room(record["seed"], FAMILIES[record["family"]])
 
     def picture(frame: int) -> Tensor:
         camera = to_capture.cameras(cameras[frame]).to(torch.float32)

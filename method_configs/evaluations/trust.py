@@ -65,18 +65,18 @@ class Trust(TableFiles):
                 f"got known {self.known}, views {self.views}, rooms {self.rooms}, samples {self.samples}"
             )
         model = Fillerbuster.from_pretrained(self.model, device=chosen_device(self.device))
-        found = [self._room(model, number) for number in track(range(self.rooms), description="rooms", transient=True)]
+        rooms = [self._room(model, number) for number in track(range(self.rooms), description="rooms", transient=True)]
         rows = []
         for part in PARTS:
             chosen = [
                 torch.tensor(one["unseen"]) if part == PARTS[1] else torch.ones(len(one["trust"]), dtype=torch.bool)
-                for one in found
+                for one in rooms
             ]
             trust, error, expected = (
                 torch.cat(
                     [
                         torch.tensor(one[name], dtype=torch.float64)[mask]
-                        for one, mask in zip(found, chosen, strict=True)
+                        for one, mask in zip(rooms, chosen, strict=True)
                     ]
                 )
                 for name in ("trust", "error", "expected")

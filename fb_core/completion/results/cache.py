@@ -54,7 +54,7 @@ def round_key(
         current: views that sampling starts from, if it does; what they do not know does not count.
     """
     options = {name: value for name, value in dataclasses.asdict(sampling).items() if name not in _ONLY_HOW}
-    told = {
+    question = {
         "version": VERSION,
         "seed": seed,
         "sampling": options,
@@ -62,7 +62,7 @@ def round_key(
         "prompt": prompt,
         "shape": [*sequence.images.shape],
     }
-    digest = hashlib.sha256(json.dumps(told, sort_keys=True, allow_nan=False).encode())
+    digest = hashlib.sha256(json.dumps(question, sort_keys=True, allow_nan=False).encode())
     for views in [sequence] if current is None else [sequence, current]:
         for part in _canonical_bytes(views):
             digest.update(part)
@@ -91,14 +91,14 @@ class CompletionCache:
             return None
         try:
             with safe_open(path, framework="pt") as file:
-                images, told = file.get_tensor(_IMAGES), file.metadata() or {}
+                images, metadata = file.get_tensor(_IMAGES), file.metadata() or {}
         except (SafetensorError, OSError, ValueError) as error:
             return _ignored(path, str(error))
         if images.dtype != torch.uint8 or tuple(images.shape) != (views, size, size, 3):
             return _ignored(
                 path, f"expected {views} pictures of {size}x{size}, got {images.dtype} of shape {list(images.shape)}"
             )
-        if told.get("key") != key or told.get("sha256") != _digest(images):
+        if metadata.get("key") != key or metadata.get("sha256") != _digest(images):
             return _ignored(path, "its content is not what its name and checksum say")
         return images
 

@@ -114,17 +114,17 @@ class CompletedViews:
 
     def __post_init__(self) -> None:
         count, height, width, _ = self.images.shape
-        told = {
+        sizes = {
             "masks": tuple(self.masks.shape[:3]),
             "cameras": (len(self.cameras), self.cameras.height, self.cameras.width),
         }
-        told["origins"] = (len(self.origins), height, width)
-        told |= {
+        sizes["origins"] = (len(self.origins), height, width)
+        sizes |= {
             name: tuple(one.shape[:3])
             for name, one in (("trust", self.trust), ("deviation", self.deviation))
             if one is not None
         }
-        for name, got in told.items():
+        for name, got in sizes.items():
             if got != (count, height, width):
                 raise ValueError(
                     f"CompletedViews: expected {name} for {(count, height, width)} like the images, got {got}"

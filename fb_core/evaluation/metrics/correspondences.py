@@ -97,9 +97,9 @@ def loftr_matcher(weights: Path, *, device: torch.device | str = "cpu") -> Match
     network = network.requires_grad_(False).eval().to(device)
 
     def matches(first: Float[Tensor, "3 h w"], second: Float[Tensor, "3 h2 w2"]) -> Correspondences:
-        found = network({"image0": _grey(first).to(device), "image1": _grey(second).to(device)})
+        output = network({"image0": _grey(first).to(device), "image1": _grey(second).to(device)})
         pairs = zip(("keypoints0", "keypoints1"), (first, second), strict=True)
-        places = [found[name].cpu().float().reshape(-1, 2) / enlargement(image) for name, image in pairs]
+        places = [output[name].cpu().float().reshape(-1, 2) / enlargement(image) for name, image in pairs]
         shifts = [0.5 / enlargement(image) for image in (first, second)]  # kornia counts pixel centres from 0
         return Correspondences(first=places[0] + shifts[0], second=places[1] + shifts[1])
 

@@ -120,9 +120,9 @@ def judge_pairs(
     results = []
     for number, (first, second) in enumerate(pairs):
         images = pictures(first), pictures(second)
-        found, truth = matcher(*images), true_rotation(cameras[first], cameras[second])
+        matches, truth = matcher(*images), true_rotation(cameras[first], cameras[second])
         tolerance = _TOLERANCE / enlargement(images[0])
-        estimated, inliers = relative_rotation(found, cameras[first], cameras[second], tolerance=tolerance)
+        estimated, inliers = relative_rotation(matches, cameras[first], cameras[second], tolerance=tolerance)
         error = FAILED if estimated is None else rotation_angle_degrees(estimated, truth)
         true_degrees = rotation_angle_degrees(truth, np.eye(3))
         results.append(
@@ -131,7 +131,7 @@ def judge_pairs(
                 second=second,
                 true_degrees=true_degrees,
                 error_degrees=error,
-                matches=len(found),
+                matches=len(matches),
                 inliers=inliers,
             )
         )

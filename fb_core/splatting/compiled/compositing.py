@@ -92,7 +92,7 @@ def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Floa
         strips.first_row, strips.rows, ellipses.camera, *bounds,
     ]  # fmt: skip
     held = [None if column is None else column.contiguous() for column in columns]
-    told = _Strips(
+    struct = _Strips(
         *[None if column is None else column.data_ptr() for column in held],
         grid.columns, grid.rows, grid.cell_width, grid.cell_height,
     )  # fmt: skip
@@ -103,13 +103,13 @@ def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Floa
     starts = torch.zeros(grid.count + 1, dtype=torch.int32)
     where = ctypes.c_void_p(None if alive is None else alive.data_ptr())
     library.fb_strips(
-        ctypes.byref(told), ctypes.c_int64(begin), ctypes.c_int64(end), where, *map(_at, (cell, wide, starts))
+        ctypes.byref(struct), ctypes.c_int64(begin), ctypes.c_int64(end), where, *map(_at, (cell, wide, starts))
     )
     starts = starts.cumsum(0, dtype=torch.int32)
     splats = torch.empty(int(starts[-1]), dtype=torch.int32)
     following = starts.clone()
     library.fb_fill(
-        ctypes.byref(told),
+        ctypes.byref(struct),
         ctypes.c_int64(begin),
         ctypes.c_int64(end),
         where,

@@ -109,16 +109,16 @@ def _private(path: Path) -> bool:
     """Whether nobody but this user can write there: a library is code."""
     if not hasattr(os, "getuid"):
         return True  # systems without owners by number: the folder is the user's own
-    told = path.stat()
-    return told.st_uid in (os.getuid(), 0) and not told.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    status = path.stat()
+    return status.st_uid in (os.getuid(), 0) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 @cache
 def _processor() -> str:
     """What decides which instructions there are."""
-    told = Path("/proc/cpuinfo")
-    lines = told.read_text(encoding="utf-8").splitlines() if told.is_file() else []
-    kept = {
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
+    features = {
         line for line in lines if line.partition("\t")[0].strip() in ("model name", "flags", "Features", "CPU part")
     }
-    return "|".join([platform.system(), platform.machine(), platform.processor(), *sorted(kept)])
+    return "|".join([platform.system(), platform.machine(), platform.processor(), *sorted(features)])

@@ -197,10 +197,10 @@ class Stretch:
             if rank < deepest and float(local[0, :width].min()) <= TRANSMITTANCE_MIN:
                 still = (local[0, :width].amax(dim=1) > TRANSMITTANCE_MIN) & (self._counts[:width] > rank)
                 if int(still.sum()) <= 0.75 * width:
-                    kept = still.nonzero()[:, 0]
-                    if kept.numel():
+                    remaining = still.nonzero()[:, 0]
+                    if remaining.numel():
                         cells, counts, starts = (
-                            column.index_select(0, kept) for column in (self.cells, self._counts, self._starts)
+                            column.index_select(0, remaining) for column in (self.cells, self._counts, self._starts)
                         )
                         self.rest = Stretch(cells, counts, starts, rank)
                     break

@@ -231,8 +231,8 @@ def _sorted_lists(owner: Tensor, base: Tensor, widths: Tensor, grid: CellGrid, a
     cell = (base - first).index_select(0, strip).add_(torch.arange(number, dtype=torch.int32, device=base.device))
     splat = owner.index_select(0, strip)
     if alive is not None:
-        kept = alive.index_select(0, cell).nonzero()[:, 0]
-        cell, splat = cell.index_select(0, kept), splat.index_select(0, kept)
+        remaining = alive.index_select(0, cell).nonzero()[:, 0]
+        cell, splat = cell.index_select(0, remaining), splat.index_select(0, remaining)
     narrow = cell.short() if grid.count < 2**15 else cell
     order = torch.sort(narrow, stable=True).indices
     counts = torch.bincount(cell, minlength=grid.count).int()

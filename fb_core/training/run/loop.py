@@ -175,15 +175,15 @@ class Run:
             optimizer.zero_grad(set_to_none=True)
             for parameters in optimizer.param_groups:
                 parameters["lr"] = self.config.rate(self.step)
-        found: list[dict[str, Tensor]] = []
+        parts_losses: list[dict[str, Tensor]] = []
         for number, rows in enumerate(self.parts):
             drawn = self._drawn(number, ahead)
             with averaged_if(self._module, self.stage.network, last=rows is self.parts[-1]):
                 with self._autocast():
                     losses = self._module(drawn)
                 (losses["loss"] / len(self.parts)).backward()
-            found.append({name: value.detach() for name, value in losses.items()})
-        means = {name: float(torch.stack([losses[name] for losses in found]).mean()) for name in found[0]}
+            parts_losses.append({name: value.detach() for name, value in losses.items()})
+        means = {name: float(torch.stack([losses[name] for losses in parts_losses]).mean()) for name in parts_losses[0]}
         means = dict(zip(means, self.group.mean(list(means.values())), strict=True))
         self._require_finite("loss", means["loss"])
         self._require_finite("gradient's norm", clip_gradients(self.stage.network, self.config.clip))
@@ -235,10 +235,12 @@ class Run:
         if math.isfinite(value):
             return
         where = self._checkpoints.find() if self._checkpoints is not None else None
-        kept = f"the last good state is {where}" if where else "there is no checkpoint yet"
+        last_state = f"the last good state is {where}" if where else "there is no checkpoint yet"
         rows = ", ".join(map(str, sorted(row for rows in self.group.gather(self._bad_rows()) for row in rows)))
         blamed = f" (rows {rows} of the batch)" if rows else ""
-        raise FloatingPointError(f"{self.stage.name}: the {what} became {value} at step {self.step}{blamed}; {kept}")
+        raise FloatingPointError(
+            f"{self.stage.name}: the {what} became {value} at step {self.step}{blamed}; {last_state}"
+        )
 
     @torch.no_grad()
     def _bad_rows(self) -> list[int]:

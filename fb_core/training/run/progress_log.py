@@ -25,13 +25,13 @@ class ProgressLog:
         self._board = _board(folder / "tensorboard", from_step) if tensorboard else None
         for path in (self._path, self._validation):
             if path.exists():
-                kept = [
+                lines = [
                     line
                     for line in path.read_text().splitlines()
                     if line.endswith("}") and json.loads(line)["step"] <= from_step
                 ]
                 with whole_file(path) as unfinished:
-                    unfinished.write_text("".join(line + "\n" for line in kept))
+                    unfinished.write_text("".join(line + "\n" for line in lines))
 
     def add(self, step: int, losses: dict[str, float], speed: dict[str, float]) -> None:
         """Note a step; ``speed`` goes to TensorBoard alone, so that two logs of one training are the same."""

@@ -277,21 +277,23 @@ def encode_sequences(
     """
     batch = sequences.images.shape[0]
     parts = []
-    for vae, values, known, kept, guessed in (
+    for vae, values, known, latents, guessed in (
         (image_vae, sequences.images, sequences.image_known, sequences.image_latents, guess),
         (raymap_vae, to_unit_range(sequences.raymaps), sequences.rays_known, None, None),
     ):
         values, known = values.flatten(0, 1), known.flatten(0, 1)
-        clean = encode_frozen(vae, values, 256, precision) if kept is None else kept.flatten(0, 1)
+        clean = encode_frozen(vae, values, 256, precision) if latents is None else latents.flatten(0, 1)
         nothing = encode_frozen(vae, torch.zeros_like(values[:1]), 1, precision)
-        told = only_known(values, known)
+        conditions = only_known(values, known)
         if guessed is not None:
-            told, known = with_guess(told, known, guessed.images.flatten(0, 1), guessed.belief.flatten(0, 1))
+            conditions, known = with_guess(
+                conditions, known, guessed.images.flatten(0, 1), guessed.belief.flatten(0, 1)
+            )
         share = known.flatten(1).mean(dim=1)
         masked = torch.where((share > 0)[:, None, None, None], clean, nothing)
         partial = (share > 0) & (share < 1)
         if bool(partial.any()):
-            masked[partial] = encode_frozen(vae, told[partial], 256, precision)
+            masked[partial] = encode_frozen(vae, conditions[partial], 256, precision)
         parts.append(
             [rearrange(x, "(b n) c h w -> b n c h w", b=batch) for x in (clean, masked, to_latent_grid(known))]
         )

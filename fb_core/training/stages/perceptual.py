@@ -34,10 +34,10 @@ def load_lpips(backbone: Path) -> nn.Module:
     own = network.net.state_dict()
     # torchmetrics cuts the backbone into slices: "slices.1.3.squeeze.weight" is torchvision's
     # "features.3.squeeze.weight".
-    found = {name: state.get("features." + name.split(".", 2)[2]) for name in own}
-    if any(not isinstance(value, Tensor) or value.shape != own[name].shape for name, value in found.items()):
+    weights = {name: state.get("features." + name.split(".", 2)[2]) for name in own}
+    if any(not isinstance(value, Tensor) or value.shape != own[name].shape for name, value in weights.items()):
         raise ValueError(
             f"lpips: {backbone} holds other weights than SqueezeNet 1.1; download squeezenet1_1 with torchvision"
         )
-    network.net.load_state_dict(found)
+    network.net.load_state_dict(weights)
     return cast(nn.Module, network)

@@ -170,11 +170,11 @@ def _row(case: Case, config: PosesBenchmark) -> dict[str, Any]:
         )
         principal = None if case.window is None else cameras.principal
         begin = time.process_time(), time.perf_counter()
-        found = recover_cameras(raymaps, weights=weights, principal=principal)
+        estimate = recover_cameras(raymaps, weights=weights, principal=principal)
         times["cpu"].append(time.process_time() - begin[0])
         times["wall"].append(time.perf_counter() - begin[1])
-        trusted += int(found.trusted.sum())
-        solved.append(errors(found.cameras, cameras))
+        trusted += int(estimate.trusted.sum())
+        solved.append(errors(estimate.cameras, cameras))
         if config.plain_steps and draw == 0:
             start = time.process_time()
             fitted = fit_cameras_plainly(
@@ -220,18 +220,18 @@ def _chi_square(config: PosesBenchmark, focal: str) -> dict[str, Any]:
     if focal == "shared":
         cameras = dataclasses.replace(cameras, focal=cameras.focal[:1].expand_as(cameras.focal))
     solving = PoseSolving(focal="shared" if focal == "shared" else "per_view", square_pixels=focal == "shared")
-    found = recover_cameras(noisy(raymaps_of(cameras), generator, 1.0), solving=solving)
-    kept = 6 if focal == "shared" else 8
-    error = _error_vector(found, cameras)[:, :kept]
-    squares = (error * torch.linalg.solve(found.covariance[:, :kept, :kept], error)).sum(dim=1) / kept
+    estimate = recover_cameras(noisy(raymaps_of(cameras), generator, 1.0), solving=solving)
+    freedom = 6 if focal == "shared" else 8
+    error = _error_vector(estimate, cameras)[:, :freedom]
+    squares = (error * torch.linalg.solve(estimate.covariance[:, :freedom, :freedom], error)).sum(dim=1) / freedom
     return {
         "part": "covariance",
         "focal": focal,
         "views": len(cameras),
         "size": small.size,
-        "freedom": kept,
+        "freedom": freedom,
         "chi_square": float(squares.mean()),
-        "expected_deviation": math.sqrt(2 / (kept * len(cameras))),
+        "expected_deviation": math.sqrt(2 / (freedom * len(cameras))),
     }
 
 

@@ -156,9 +156,9 @@ def _solvable(config: SamplerBenchmark, guidance: float, number: int) -> _Proble
 
     component = torch.randint(3, (16,), generator=generator)
     spread = condition.variances[component].sqrt()
-    told = condition.means[component] + spread * torch.randn(16, 64, generator=generator, dtype=torch.float64)
-    counts = (torch.arange(64) < 32).to(told).expand(16, -1)
-    joined = imposed(field(), told, start, counts, until=config.strength)
+    sample = condition.means[component] + spread * torch.randn(16, 64, generator=generator, dtype=torch.float64)
+    counts = (torch.arange(64) < 32).to(sample).expand(16, -1)
+    joined = imposed(field(), sample, start, counts, until=config.strength)
     exact, exact_joined = (fine_endpoint(flow, start, steps=config.fine_steps) for flow in (field(), joined))
     return _Problem(
         field=field(),
@@ -187,10 +187,10 @@ def _trained(config: SamplerBenchmark, model: Fillerbuster, guidance: float, num
 
     plain = model.denoising(views, seed=config.seed, sampling=sampling)
     start, later = plain.start(), dataclasses.replace(sampling, strength=config.strength)
-    told = model.denoising(whole, seed=config.seed, sampling=sampling).conditioning.channels[:, :STATE_CHANNELS]
-    counts = torch.ones_like(told)
-    counts[len(views) // 2 :, :LATENT_CHANNELS, :, told.shape[-1] // 2 :] = 0
-    joined = dataclasses.replace(plain, sampling=later, current=told, counts=counts).field()
+    latents = model.denoising(whole, seed=config.seed, sampling=sampling).conditioning.channels[:, :STATE_CHANNELS]
+    counts = torch.ones_like(latents)
+    counts[len(views) // 2 :, :LATENT_CHANNELS, :, latents.shape[-1] // 2 :] = 0
+    joined = dataclasses.replace(plain, sampling=later, current=latents, counts=counts).field()
     exact = integrate(field(), start, time_grid(config.fine_steps), solver="ab2")
     exact_joined = integrate(joined, start, time_grid(config.fine_steps, through=(config.strength,)), solver="ab2")
     return _Problem(
@@ -252,7 +252,7 @@ def _measure(report: Report, config: SamplerBenchmark, flow: str, problems: list
                     "steps": steps,
                     "passes": problems[0].passes(solver, times),
                 }
-                mine.append({**row, "error": (found := error(solver, times)), "reached": found <= wanted})
+                mine.append({**row, "error": (deviation := error(solver, times)), "reached": deviation <= wanted})
     report.rows.extend(mine)
     ours = {"solver": SamplingConfig().solver, "grid": grid_name(SamplingConfig().shift)}
     default = [row["passes"] for row in mine if row["reached"] and ours.items() <= row.items()]
@@ -328,9 +328,9 @@ def _measure_poses(report: Report, config: SamplerBenchmark, model: Fillerbuster
                     views, generator=torch.Generator().manual_seed(config.seed), sampling=sampling
                 ).raymaps[1:, 3:]
 
-            found, fine = rays(steps), rays(4 * max(config.pose_steps))
-            own += _degrees(found, fine) / config.problems
-            true += _degrees(found, views.raymaps[1:, 3:]) / config.problems
+            directions, fine = rays(steps), rays(4 * max(config.pose_steps))
+            own += _degrees(directions, fine) / config.problems
+            true += _degrees(directions, views.raymaps[1:, 3:]) / config.problems
         report.rows.append(
             {
                 "part": "raymaps of views beside one that is posed",

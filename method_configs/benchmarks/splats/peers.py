@@ -155,7 +155,7 @@ def _pairs(*given: Any) -> tuple[Tensor, Tensor, Tensor]:
     """
     means2d, conics, opacities, width, height, tile, offsets, splats = given[3:]  # those before say where to begin
     ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(splats)])]).tolist()
-    found: list[tuple[Tensor, Tensor]] = []
+    pairs: list[tuple[Tensor, Tensor]] = []
     for number, (begin, end) in enumerate(zip(offsets.flatten().tolist(), ends, strict=True)):
         if begin == end:
             continue
@@ -168,9 +168,9 @@ def _pairs(*given: Any) -> tuple[Tensor, Tensor, Tensor]:
             means2d[0, chosen], conics[0, chosen], opacities[0, chosen], torch.stack([x, y], -1).reshape(-1, 2) + 0.5
         )
         pixel, rank = ((alphas > 0) & (torch.cumprod(1 - alphas, dim=1) > _STOP)).nonzero(as_tuple=True)
-        found.append((chosen[rank], (y * width + x).reshape(-1)[pixel]))
+        pairs.append((chosen[rank], (y * width + x).reshape(-1)[pixel]))
     nothing = splats.new_zeros(0).long()
-    gaussians, pixels = (torch.cat([nothing, *parts]) for parts in (zip(*found, strict=True) if found else ((), ())))
+    gaussians, pixels = (torch.cat([nothing, *parts]) for parts in (zip(*pairs, strict=True) if pairs else ((), ())))
     return gaussians, pixels, torch.zeros_like(pixels)
 
 

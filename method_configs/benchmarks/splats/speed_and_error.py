@@ -102,15 +102,15 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
     errors = _errors(_picture_and_gradients(draw_torch, scene), exact)
     megabytes = _peak_megabytes(draw_torch, scene)
     others = {"gsplat torch": gsplat_torch, "tile loop": tile_loop} if len(scene.means) <= config.most_for_peers else {}
-    told = {}
+    peers = {}
     for name, draw in (others if config.peer_runs else {}).items():
-        told[name] = {**_errors(_picture_and_gradients(draw, scene), exact), "peak_mb": _peak_megabytes(draw, scene)}
-    times: dict[str, list[tuple[float, float]]] = {"ours": [], **{name: [] for name in told}}
+        peers[name] = {**_errors(_picture_and_gradients(draw, scene), exact), "peak_mb": _peak_megabytes(draw, scene)}
+    times: dict[str, list[tuple[float, float]]] = {"ours": [], **{name: [] for name in peers}}
     rates = []
     for run in range(config.runs):  # in turn, so that a busy moment of the machine meets all of them
         rates.append(_exponentials_per_second())
         times["ours"].append(seconds_of(draw_torch, scene))
-        for name in told if run < config.peer_runs else ():
+        for name in peers if run < config.peer_runs else ():
             times[name].append(seconds_of(others[name], scene))
     forward, both = (statistics.median(taken) for taken in zip(*times["ours"], strict=True))
     parts["ours"].append(
@@ -123,7 +123,7 @@ def _measure(scene: SplatScene, config: SplatBenchmark, parts: dict[str, list[di
             **errors,
         }
     )
-    for name, values in told.items():
+    for name, values in peers.items():
         slow_forward, slow_both = (statistics.median(taken) for taken in zip(*times[name], strict=True))
         parts["peers"].append({
             "part": "peers", "scene": scene.name, "peer": name, "forward_seconds": slow_forward,
@@ -276,11 +276,11 @@ def _bars(parts: dict[str, list[dict[str, Any]]]) -> list[Bar]:
             bars.append(Bar(name=f"peak MB, {scene}", value=row["peak_mb"], limit=MEGABYTES[scene], sense="<="))
     for row in parts["compiled"]:
         if row["scene"] == "50k@512" and row["threads"] == 1:
-            told = "compiled, times faster than torch on one thread, 50k@512"
-            bars.append(Bar(name=told, value=row["both_ratio"], limit=2.5, sense=">="))
+            label = "compiled, times faster than torch on one thread, 50k@512"
+            bars.append(Bar(name=label, value=row["both_ratio"], limit=2.5, sense=">="))
     for row in parts["peers"]:
         limits = TIMES_FASTER.get(row["scene"], ()) if row["peer"] == "gsplat torch" else ()
         for limit, name in zip(limits, ("forward", "both"), strict=False):
-            told = f"{name}, times faster than gsplat's torch, {row['scene']}"
-            bars.append(Bar(name=told, value=row[f"{name}_ratio"], limit=limit, sense=">="))
+            label = f"{name}, times faster than gsplat's torch, {row['scene']}"
+            bars.append(Bar(name=label, value=row[f"{name}_ratio"], limit=limit, sense=">="))
     return bars

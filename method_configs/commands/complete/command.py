@@ -80,27 +80,27 @@ def complete_scene(source: Path, output: Path, options: CompleteOptions, *, over
         from_model = not options.poses_only and not scene
         model = _load_model(options, needed=from_model or (options.cameras != "features" and not job.all_known))
     with _work_of_scene(job, options, output, model) if scene else nullcontext() as work:
-        found, new, told = _work(job, options, model, clock, work)
-        job = dataclasses.replace(job, photos=found.as_used(job.photos))
-        enough = len(found.trusted) >= FEWEST
-        report = report_of(source, options, job.photos, job.left_out, model, found, told)
+        cameras, new, details = _work(job, options, model, clock, work)
+        job = dataclasses.replace(job, photos=cameras.as_used(job.photos))
+        enough = len(cameras.trusted) >= FEWEST
+        report = report_of(source, options, job.photos, job.left_out, model, cameras, details)
         try:
             with whole_folder(target) as folder:
                 with clock.stage("writing"):
                     world = (
-                        job.world if enough or not found.trusted else dataclasses.replace(job.world, points_path=None)
+                        job.world if enough or not cameras.trusted else dataclasses.replace(job.world, points_path=None)
                     )
-                    write_folder(folder, job.photos, job.left_out, found, new, world, fps=options.fps)
+                    write_folder(folder, job.photos, job.left_out, cameras, new, world, fps=options.fps)
                 report |= {"seconds": clock.seconds, "peak_memory_gib": round(_peak_memory_gib(), 3)}
                 write_report(folder, report)
         except (OSError, ValueError) as error:
             raise ValueError(f"{output}: {error}; nothing was written") from error
     if not enough:
-        raise NoCameras(no_cameras(job.photos, found, output))
+        raise NoCameras(no_cameras(job.photos, cameras, output))
     _logger.info(
         "wrote %s: %d photos with cameras, %d new views",
         output,
-        len(found.trusted),
+        len(cameras.trusted),
         0 if new is None else len(new.images),
     )
     return report
@@ -276,25 +276,25 @@ def _work(
     sampling = None if model is None else pose_sampling(model, options)
     expected = forecast(job.photos, options, model, plan, sampling)
     _logger.info(announcement_of_work(job.photos, options, model, plan, sampling, expected))
-    found = _find_cameras(job, options, model, clock)
-    photos = found.as_used(job.photos)
-    if plan is not None and len(found.trusted) >= FEWEST:
+    cameras = _find_cameras(job, options, model, clock)
+    photos = cameras.as_used(job.photos)
+    if plan is not None and len(cameras.trusted) >= FEWEST:
         _logger.info(
             "The cameras took %.0f s; %s left.",
             clock.seconds["cameras"],
             duration_in_words(expected.left(clock.seconds)),
         )
-    if plan is None or model is None or len(found.trusted) < FEWEST:
-        return found, None, {}
-    context = choose_context(found, options.photos)
+    if plan is None or model is None or len(cameras.trusted) < FEWEST:
+        return cameras, None, {}
+    context = choose_context(cameras, options.photos)
     if path is None:
-        path = path_cameras(options.path, [found.camera(index) for index in found.trusted], views, size=plan.side)
+        path = path_cameras(options.path, [cameras.camera(index) for index in cameras.trusted], views, size=plan.side)
     if len(context) < plan.photos:
         plan = Plan.of(len(context), views, model, options)
     with bars() as on_progress, clock.stage("new views"):
         images = generate(
             [photos[index] for index in context],
-            [found.camera(index) for index in context],
+            [cameras.camera(index) for index in context],
             path,
             plan.passes,
             model,
@@ -314,22 +314,22 @@ def _work(
         )
         for view in range(len(path))
     )
-    told: dict[str, Any] = {
+    details: dict[str, Any] = {
         "context": [job.photos[index].name for index in context],
         "passes": [len(chosen) for chosen in plan.passes.views],
     }
     new = NewViews(images=images, cameras=path, origins=origins)
     if options.check:
         with bars(), clock.stage("self-consistency"):
-            told["self_consistency"] = agreement(photos, found, context, new, model, options)
-    return found, new, told
+            details["self_consistency"] = agreement(photos, cameras, context, new, model, options)
+    return cameras, new, details
 
 
 def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None, clock: Clock) -> FoundCameras:
     """And say what was found."""
     sampling = None if model is None else pose_sampling(model, options)
     with bars() as on_progress, clock.stage("cameras"):
-        found = find_cameras(
+        cameras = find_cameras(
             job.photos,
             method=options.cameras,
             model=model,
@@ -337,9 +337,9 @@ def _find_cameras(job: Job, options: CompleteOptions, model: Fillerbuster | None
             sampling=sampling,
             on_progress=on_progress,
         )
-    for line in what_was_found(job.photos, found):
+    for line in what_was_found(job.photos, cameras):
         _logger.info(line)
-    return found
+    return cameras
 
 
 def _work_on_scene(
@@ -350,22 +350,22 @@ def _work_on_scene(
     from method_configs.commands.complete.scenes.scene_work import keep_cameras, kept_cameras
 
     began = time.perf_counter()
-    found = kept_cameras(work, job.photos)
-    if found is None:
+    cameras = kept_cameras(work, job.photos)
+    if cameras is None:
         sampling = None if model is None else pose_sampling(model, options)
         expected = forecast(job.photos, options, model, None, sampling)
         _logger.info(announcement_of_work(job.photos, options, model, None, sampling, expected))
-        found = _find_cameras(job, options, model, clock)
-        keep_cameras(work, found)
+        cameras = _find_cameras(job, options, model, clock)
+        keep_cameras(work, cameras)
     else:
-        _logger.info("Going on with what an earlier try has left: %d cameras are there.", len(found.trusted))
-    if len(found.trusted) < FEWEST:
-        return found, None, {}
-    scene = SceneJob.of(found.as_used(job.photos), found, job.world.points_path, options, work)
+        _logger.info("Going on with what an earlier try has left: %d cameras are there.", len(cameras.trusted))
+    if len(cameras.trusted) < FEWEST:
+        return cameras, None, {}
+    scene = SceneJob.of(cameras.as_used(job.photos), cameras, job.world.points_path, options, work)
     left = 60 * options.minutes - (time.perf_counter() - began)
     with bars() as on_progress, clock.stage("scene"):
-        new, told = complete_with_splats(scene, seconds=left, on_progress=on_progress)
-    return found, new, told
+        new, details = complete_with_splats(scene, seconds=left, on_progress=on_progress)
+    return cameras, new, details
 
 
 def _path_of_file(options: CompleteOptions, side: int) -> Pinholes | None:

@@ -315,13 +315,13 @@ def _write_sheet(
             [found.registration.verdicts[index] for index in others],
         ),
     ]
-    told = f"{0 if new is None else len(new.images)} new views"
+    new_part = f"{0 if new is None else len(new.images)} new views"
     if new is not None and new.film is not None:
         strips += _film_strips(new.film)
-        told = f"a film of {len(new.film.cameras)} pictures, {told} generated"
+        new_part = f"a film of {len(new.film.cameras)} pictures, {new_part} generated"
     elif new is not None:
         strips.append(Strip(heading=f"New views along the path ({len(new.images)})", pictures=list(new.images)))
-    title = f"{len(trusted)} of {len(photos) + len(left_out)} photos with a camera, {told}"
+    title = f"{len(trusted)} of {len(photos) + len(left_out)} photos with a camera, {new_part}"
     subtitle = {"known": "cameras were given", "model": "cameras by the model", "features": "cameras by features"}[
         found.method
     ]

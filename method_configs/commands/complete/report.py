@@ -99,7 +99,7 @@ def what_was_found(photos: list[Photo], found: FoundCameras) -> list[str]:
 
 def no_cameras(photos: list[Photo], found: FoundCameras, output: Path) -> str:
     """Why there is no capture, and what can be done."""
-    told = "; ".join(f"{_METHODS[method]}: {_in_short(registration)}" for method, registration in found.answers)
+    answers = "; ".join(f"{_METHODS[method]}: {_in_short(registration)}" for method, registration in found.answers)
     other = "features" if "features" not in found.tried else "model" if "model" not in found.tried else None
     advice = (
         f"try --cameras {other}"
@@ -108,7 +108,7 @@ def no_cameras(photos: list[Photo], found: FoundCameras, output: Path) -> str:
     )
     return (
         f"cameras of {len(photos)} photos: expected at least two that can be trusted, got {len(found.trusted)} "
-        f"({told}); {advice}. "
+        f"({answers}); {advice}. "
         f"None was made up; {output} has the report"
     )
 

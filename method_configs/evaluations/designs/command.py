@@ -156,14 +156,14 @@ class Designs:
         work = DesignTrainings(
             self.output, self.batches, Fillerbuster.from_pretrained(self.model), DesignTask(rooms=self.rooms)
         )
-        found: dict[tuple[str, int], dict[str, Any]] = {}
+        results: dict[tuple[str, int], dict[str, Any]] = {}
         for seed in self.seeds:
             for name in names:
                 recipe = dataclasses.replace(known[name].recipe, seed=seed)
-                found[name, seed] = work.measured(known[name]._replace(recipe=recipe))
+                results[name, seed] = work.measured(known[name]._replace(recipe=recipe))
         report = Report(seed=self.seeds[0])
-        report.rows.extend(table(found, names, self.seeds))
-        report.rows.extend(curves(found, names, self.seeds))
+        report.rows.extend(table(results, names, self.seeds))
+        report.rows.extend(curves(results, names, self.seeds))
         show(report, self.json, [])
 
 
@@ -189,17 +189,17 @@ class DesignTrainings:
             "recipe": str(recipe),
         }
         path = folder / "measured.json"
-        if path.exists() and (kept := json_format.loads(path.read_text()))["asked"] == asked:
-            return kept["found"]
+        if path.exists() and (stored := json_format.loads(path.read_text()))["asked"] == asked:
+            return stored["found"]
         self._claim(folder, {name: asked[name] for name in ("recipe", "batches", "autoencoders")})
-        network, found = self._trained(design, folder)
-        found |= self._scores(network, design, guess=design.told_guess)
+        network, result = self._trained(design, folder)
+        result |= self._scores(network, design, guess=design.told_guess)
         if design.told_guess:
-            found["without"] = self._scores(network, design, guess=False)
+            result["without"] = self._scores(network, design, guess=False)
         with whole_file(path) as unfinished:
-            unfinished.write_text(json_format.dumps({"asked": asked, "found": found}, indent=1) + "\n")
-        _logger.info("%s: %s", folder.name, ", ".join(f"{name} {found[name]:.3f}" for name in _METRICS))
-        return found
+            unfinished.write_text(json_format.dumps({"asked": asked, "found": result}, indent=1) + "\n")
+        _logger.info("%s: %s", folder.name, ", ".join(f"{name} {result[name]:.3f}" for name in _METRICS))
+        return result
 
     def _claim(self, folder: Path, settings: dict[str, Any]) -> None:
         """A training is gone on with only if all that decides it is as before."""
@@ -239,12 +239,12 @@ class DesignTrainings:
         assert isinstance(run.stage.network, DiT)
         network = type(run.stage.network)(recipe.dit)
         network.load_state_dict(run.averaged_state())
-        found = {
+        result = {
             "parameters": sum(parameter.numel() for parameter in network.parameters()),
             "cpu_seconds_per_step": statistics.median(seconds) if seconds else math.nan,
             "losses": windows([json_format.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]),
         }
-        return network, found
+        return network, result
 
     def stage_of(self, design: Design, batches: KeptBatches) -> Stage:
         """What a design minimises, with fresh weights."""

@@ -86,13 +86,18 @@ def asked_rooms(task: DesignTask, *, image_vae: VAE, raymap_vae: VAE, size: int,
         carried = carried_over(given.images, known[: task.known], raymaps_of(given.cameras), raymaps_of(hidden.cameras))
         guess, belief = torch.zeros_like(room.images), torch.zeros_like(known)
         guess[task.known :], belief[task.known :] = carried.images, BELIEF_BY_DIRECTION * carried.there
-        told = room.images, known, rays, torch.ones_like(known)
+        sequence = room.images, known, rays, torch.ones_like(known)
         vaes = {"image_vae": image_vae, "raymap_vae": raymap_vae, "transformer": framed}
         latents = unsplit(
             encode_in_chunks(image_vae, room.images, task.views), encode_in_chunks(raymap_vae, rays, task.views)
         )
         parts.append(
-            (latents, encode_known(*told, **vaes), encode_known(*told, **vaes, guess=(guess, belief)), hidden.images)
+            (
+                latents,
+                encode_known(*sequence, **vaes),
+                encode_known(*sequence, **vaes, guess=(guess, belief)),
+                hidden.images,
+            )
         )
     latents, plain, guessed, hidden = zip(*parts, strict=True)
     data = torch.stack(latents)

@@ -149,7 +149,7 @@ def complete_with_splats(job: SceneJob, *, seconds: float, on_progress: OnProgre
     )
     splats, generated, trust = _trained(job, capture, budget, on_progress)
     film, shares = _film(job, capture, splats, budget, on_progress)
-    told = {
+    details = {
         "splats": {
             "file": "splats.ply",
             "gaussians": len(splats),
@@ -173,7 +173,7 @@ def complete_with_splats(job: SceneJob, *, seconds: float, on_progress: OnProgre
             ],
         },
     }
-    return _new_views(generated, film), told
+    return _new_views(generated, film), details
 
 
 def announcement_of_scene(job: SceneJob, budget: SceneBudget) -> str:
@@ -197,13 +197,13 @@ def announcement_of_scene(job: SceneJob, budget: SceneBudget) -> str:
 
 def _budget(job: SceneJob, seconds: float) -> SceneBudget:
     """Decided once, and kept: a command that goes on does not decide anew."""
-    kept = job.work / "scene.json"
-    if kept.is_file():
-        told = read_json(kept)
-        speed, seconds = Speed(**told["speed"]), float(told["seconds"])
+    path = job.work / "scene.json"
+    if path.is_file():
+        state = read_json(path)
+        speed, seconds = Speed(**state["speed"]), float(state["seconds"])
     else:
         speed = measured_speed(job.device)
-        with whole_file(kept) as unfinished:
+        with whole_file(path) as unfinished:
             unfinished.write_text(
                 json.dumps({"speed": dataclasses.asdict(speed), "seconds": seconds}), encoding="utf-8"
             )

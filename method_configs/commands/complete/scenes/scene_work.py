@@ -62,12 +62,12 @@ def question_of(photos: Sequence[Photo], options: Any, model_hash: str | None) -
             None if photo.camera is None else photo.camera.camera_to_world.flatten().tolist(),
         )
         files.append((photo.name, str(photo.source), photo.seconds, file.st_size, file.st_mtime_ns, pose))
-    told = {
+    question = {
         "format": _FORMAT,
         "photos": files,
         "options": {key: str(value) for key, value in dataclasses.asdict(options).items()},
     }
-    return hashlib.sha256(json.dumps(told | {"model": model_hash}, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(question | {"model": model_hash}, sort_keys=True).encode()).hexdigest()
 
 
 def folder_beside(output: Path) -> Path:
@@ -154,10 +154,10 @@ def kept_cameras(folder: Path, photos: Sequence[Photo]) -> FoundCameras | None:
 
 def _question_in(folder: Path) -> str | None:
     try:
-        told = read_json(folder / _JOB)
+        state = read_json(folder / _JOB)
     except (OSError, ValueError):
         return None
-    return str(told.get("question")) if isinstance(told, dict) else None
+    return str(state.get("question")) if isinstance(state, dict) else None
 
 
 def _remove(folder: Path) -> None:
