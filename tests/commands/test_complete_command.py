@@ -4,7 +4,6 @@ to refuse.
 
 from __future__ import annotations
 
-import functools
 import json
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import torch
 from helpers.folders.camera_paths import write_path
 from helpers.folders.films import write_film
 from helpers.processes.complete_commands import _folder, complete, posed, refusal
+from helpers.small_figures import draw_small
 from helpers.textured_box import cameras_on_an_arc, render, save_photos
 from helpers.tiny_models import save_tiny_model
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
@@ -23,13 +23,9 @@ from PIL import Image
 from fb_core.data import media
 from fb_core.data.capture.captures import FrameToWrite, read_capture, validate_capture, write_capture
 from fb_core.data.capture.points import read_points
-from fb_core.evaluation.figures.camera_figure import draw_cameras
-from fb_core.evaluation.figures.contact_sheet import write_contact_sheet
 from fb_core.evaluation.metrics.pose_metrics import pose_errors
 from fb_core.files.ownership import MARK_NAME
 from fb_nerfstudio.capture.dataparser import NerfstudioWithoutOpen3d
-from method_configs.commands import command_line as commands
-from method_configs.commands.complete import output as complete_output
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +35,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(complete_output, "draw_cameras", functools.partial(draw_cameras, size=(120, 80)))
-    monkeypatch.setattr(complete_output, "write_contact_sheet", functools.partial(write_contact_sheet, dpi=20))
-    monkeypatch.delenv(commands.DEBUG_VARIABLE, raising=False)
+    draw_small(monkeypatch)
 
 
 # ---- what comes out --------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -13,15 +12,13 @@ import pytest
 import torch
 from helpers.folders.films import write_film
 from helpers.processes.complete_commands import _folder, complete, posed, refusal
+from helpers.small_figures import draw_small
 from helpers.textured_box import cameras_on_an_arc, render, save_photos
 from helpers.tiny_models import save_tiny_model
 
 from fb_core.data import media
 from fb_core.data.capture.captures import FrameToWrite, read_capture, write_capture
 from fb_core.data.photos.collection import read_photos
-from fb_core.evaluation.figures.camera_figure import draw_cameras
-from fb_core.evaluation.figures.contact_sheet import write_contact_sheet
-from method_configs.commands import command_line as commands
 from method_configs.commands.complete import command as complete_command
 from method_configs.commands.complete import output as complete_output
 
@@ -33,9 +30,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(complete_output, "draw_cameras", functools.partial(draw_cameras, size=(120, 80)))
-    monkeypatch.setattr(complete_output, "write_contact_sheet", functools.partial(write_contact_sheet, dpi=20))
-    monkeypatch.delenv(commands.DEBUG_VARIABLE, raising=False)
+    draw_small(monkeypatch)
 
 
 def files(folder: Path) -> dict[Path, bytes]:

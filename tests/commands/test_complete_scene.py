@@ -5,7 +5,6 @@ any stage.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import math
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import av
 import pytest
 import torch
+from helpers.small_figures import draw_small
 from helpers.textured_box import cameras_on_an_arc, render
 from helpers.tiny_models import save_tiny_model
 
@@ -21,8 +21,6 @@ from fb_core.completion.fly_through import FoundCameras
 from fb_core.data.capture.captures import FrameToWrite, validate_capture, write_capture
 from fb_core.data.photos.photo import Photo
 from fb_core.data.photos.straight_photos import straightened
-from fb_core.evaluation.figures.camera_figure import draw_cameras
-from fb_core.evaluation.figures.contact_sheet import write_contact_sheet
 from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.pose_solver.verdict import Arrangement
 from fb_core.geometry.similarity import Similarity
@@ -31,7 +29,6 @@ from fb_nerfstudio.splats.backend import BLUR, render_splats
 from fb_nerfstudio.splats.splat_file import Splats, read_splats
 from method_configs.commands import command_line as commands
 from method_configs.commands.complete import command as complete_command
-from method_configs.commands.complete import output as complete_output
 from method_configs.commands.complete.scenes import scene as complete_scene
 from method_configs.commands.complete.scenes import scene_work
 
@@ -45,9 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(complete_output, "draw_cameras", functools.partial(draw_cameras, size=(120, 80)))
-    monkeypatch.setattr(complete_output, "write_contact_sheet", functools.partial(write_contact_sheet, dpi=20))
-    monkeypatch.delenv(commands.DEBUG_VARIABLE, raising=False)
+    draw_small(monkeypatch)
 
 
 def complete(source: Path, output: Path, model: Path, *options: object) -> dict[str, Any]:

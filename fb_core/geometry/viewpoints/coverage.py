@@ -124,8 +124,9 @@ def choose_views(
     while len(indices) < most and len(shown):
         added = matrix @ need.float()
         gain = torch.where((added > 0) & (added >= least), added * certain, 0.0)
-        elsewhere = gain * unused if bool((gain * unused > 0).any()) else gain
-        best = int((elsewhere if worth is None else elsewhere * worth).argmax())
+        elsewhere = gain * unused
+        offered = elsewhere if bool((elsewhere > 0).any()) else gain
+        best = int((offered if worth is None else offered * worth).argmax())
         if float(gain[best]) <= 0:
             break
         unused[best] = False
