@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import torch
@@ -23,11 +24,14 @@ from fb_core.geometry.similarity import Similarity
 from fb_core.inpainter import Fillerbuster, SamplingConfig
 from fb_core.registration.by_features import recover_with_features
 from fb_core.registration.by_raymaps import ROUNDS, RaymapCameras, recover_with_model
+from fb_core.registration.two_draws import AGREEING_DEGREES, LEAST_AGREEMENT, agreement
 
 DOUBTFUL_DEGREES = 3.0
 """Raymaps that stray more from a pinhole camera's were not understood by the model: well denoised ones stray by less
 than 0.1 degrees.
 """
+
+_ANOTHER_SEED = 2**31  # apart from the seeds of a draw's windows
 
 OnProgress = Callable[[str, int, int], None]
 """Told what is being done, how much of it is done, and how much there is."""
@@ -73,7 +77,8 @@ def register(
 
     Args:
         photos: two or more.
-        method: "model" denoises raymaps given the images; "features" matches SIFT features and adjusts a bundle (no
+        method: "model" denoises raymaps given the images, a second time where they are those of firm cameras, and
+            believes what is the same (`two_draws`); "features" matches SIFT features and adjusts a bundle (no
             model is needed).
         model: for "model".
         seed: decides the samples.
@@ -99,48 +104,61 @@ def register(
     if method == "model":
         assert model is not None
         sampling = sampling or dataclasses.replace(model.recommended_sampling.for_poses(), rounds=ROUNDS)
-        recovered = recover_with_model(
-            photos, model, seed=seed, sampling=sampling, views_at_once=views_at_once, on_progress=report
-        )
-        return _of_raymaps(photos, recovered)
+        ask = partial(recover_with_model, model=model, sampling=sampling, views_at_once=views_at_once)
+        return _asked_twice(photos, ask, seed=seed, on_progress=report)
     return _of_features(photos, *recover_with_features(photos, on_progress=report))
 
 
-def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
-    """Raymaps that stray from every pinhole camera are the model's own doubt: good ones err by a twentieth of a
-    degree.
+def _asked_twice(
+    photos: Sequence[Photo], ask: Callable[..., RaymapCameras], *, seed: int, on_progress: OnProgress
+) -> Registration:
+    """A model's cameras; those of firm rays are asked for once more, the photos the other way round, so that nothing
+    but they is the same.
+    """
+    recovered = ask(photos, seed=seed, on_progress=on_progress)
+    if not any(_is_firm(residual) for residual in recovered.residuals_degrees):
+        return _of_raymaps(photos, recovered, [None] * len(photos))
+
+    def once_more(what: str, done: int, steps: int) -> None:
+        on_progress(f"{what} once more", done, steps)
+
+    again = ask(photos[::-1], seed=seed ^ _ANOTHER_SEED, on_progress=once_more)
+    return _of_raymaps(photos, recovered, again.cameras[::-1])
+
+
+def _is_firm(residual_degrees: float) -> bool:
+    return residual_degrees <= DOUBTFUL_DEGREES  # NaN is not
+
+
+def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras, again: Sequence[Pinholes | None]) -> Registration:
+    """Raymaps that stray from every pinhole camera are the model's own doubt (good ones err by a twentieth of a
+    degree); so are cameras that are others when the model is asked again.
     """
     verdicts, reasons = [], []
-    for photo, camera, reason, residual in zip(
-        photos, found.cameras, found.reasons, found.residuals_degrees, strict=True
+    arrangement = _arrangement(photos, found)
+    shares = agreement(found.cameras, again, apart=arrangement is Arrangement.APART).tolist()
+    for photo, camera, reason, residual, share in zip(
+        photos, found.cameras, found.reasons, found.residuals_degrees, shares, strict=True
     ):
         if photo.camera is not None:
             verdict, reason = "known", ""
         elif camera is None:
             verdict = "no camera"
-        elif residual > DOUBTFUL_DEGREES:
+        elif not _is_firm(residual):
             verdict, reason = (
                 "doubtful",
                 f"its rays stray from a camera's by {residual:.1f} degrees, expected at most {DOUBTFUL_DEGREES:g}",
+            )
+        elif not share >= LEAST_AGREEMENT:  # NaN: nobody to compare with
+            verdict, reason = (
+                "doubtful",
+                f"asked twice, the model turns and shifts it alike to {0 if math.isnan(share) else share:.0%} of the "
+                f"other photos (within {AGREEING_DEGREES:g} degrees), expected at least {LEAST_AGREEMENT:.0%}",
             )
         else:
             verdict, reason = "ok", ""
         verdicts.append(verdict)
         reasons.append(reason)
-    placed = [
-        (camera, 0.0 if math.isnan(off) else off)
-        for camera, off in zip(found.cameras, found.origin_deviations, strict=True)
-        if camera
-    ]
-    arrangement = Arrangement.NO_CAMERA
-    if placed:
-        centers = torch.cat([camera.centers for camera, _ in placed])
-        given = [photo.camera.centers[0] for photo in photos if photo.camera is not None]
-        centers = (
-            centers - given[0].to(centers) if given else centers
-        )  # rounding is that of the place that raymaps were denoised at
-        deviations = centers.new_tensor([off for _, off in placed])
-        arrangement = arrangement_of(centers, deviations, precision=torch.finfo(torch.float32).eps)
     return Registration(
         cameras=_in_one_world(photos, found.cameras, verdicts),
         verdicts=tuple(verdicts),
@@ -149,6 +167,24 @@ def _of_raymaps(photos: Sequence[Photo], found: RaymapCameras) -> Registration:
         raymaps=found.raymaps,
         arrangement=arrangement,
     )
+
+
+def _arrangement(photos: Sequence[Photo], found: RaymapCameras) -> Arrangement:
+    """How the cameras stand to each other, as far as their origins' deviations tell."""
+    placed = [
+        (camera, 0.0 if math.isnan(off) else off)
+        for camera, off in zip(found.cameras, found.origin_deviations, strict=True)
+        if camera
+    ]
+    if not placed:
+        return Arrangement.NO_CAMERA
+    centers = torch.cat([camera.centers for camera, _ in placed])
+    given = [photo.camera.centers[0] for photo in photos if photo.camera is not None]
+    centers = (
+        centers - given[0].to(centers) if given else centers
+    )  # rounding is that of the place that raymaps were denoised at
+    deviations = centers.new_tensor([off for _, off in placed])
+    return arrangement_of(centers, deviations, precision=torch.finfo(torch.float32).eps)
 
 
 def _of_features(

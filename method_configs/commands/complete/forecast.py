@@ -23,6 +23,7 @@ _FEATURES = 42e9  # a million pixels in which features are looked for
 _PER_PIXEL = 1 / 20  # features per pixel, at most
 _MATCH = 1000  # two features of two photos
 _BUILD, _CROWD = 6.3e9, 24  # a photo and each of the others, up to so many, that cameras are found together with
+_DRAWS = 2  # a model is asked twice for cameras
 _DRAW, _SHOWN = 400e9, 12e9  # the sheet and the cameras' picture; each picture in them
 _PROCESS, _BYTES = int(1.3 * GIB), 4  # with all libraries loaded; of a pixel of every photo
 _SLOWEST, _FASTEST = 8.0, 1 / 8  # by which the rest is corrected at most
@@ -108,9 +109,10 @@ def _seconds_of_features(looked_at: Sequence[float], stored: Sequence[float]) ->
 
 
 def _seconds_of_raymaps(model: Fillerbuster, count: int, sampling: SamplingConfig) -> float:
+    """Of a model that finds cameras; one that finds none is asked once, in half the time."""
     together = min(count, POSES_AT_ONCE)
     window = SquareSequence(views=together, known=together, side=model.size, recovers_rays=True)
-    return count / together * expected_seconds(model, window, sampling)
+    return _DRAWS * count / together * expected_seconds(model, window, sampling)
 
 
 def _seconds_of_pass(model: Fillerbuster, plan: Plan, number: int) -> float:
