@@ -118,7 +118,7 @@ def draw(report: Report, path: Path) -> None:
     cells = [row for row in report.rows if "size" in row]
     found = {(row["curve"], row["of"]): row for row in report.rows if "size" not in row}
     kinds = list(dict.fromkeys(row["of"] for row in cells))
-    figure, axes = pyplot.subplots(2, len(kinds), figsize=(3.6 * len(kinds), 7), layout="constrained", squeeze=False)
+    figure, axes = pyplot.subplots(2, len(kinds), figsize=(3.8 * len(kinds), 7.5), layout="constrained", squeeze=False)
     for column, of in enumerate(kinds):
         for curve in dict.fromkeys(row["curve"] for row in cells if row["of"] == of):
             rows = [row for row in cells if (row["curve"], row["of"]) == (curve, of)]
@@ -132,7 +132,7 @@ def draw(report: Report, path: Path) -> None:
             one.set_xlabel("share unknown" if of == "share known" else of)
             one.spines[["top", "right"]].set_visible(False)
             if one.lines:
-                one.legend(fontsize=6, loc="best")
+                one.legend(fontsize=6, loc="lower left", bbox_to_anchor=(0, 1), frameon=False)
     save_figure(figure, path, origin_of(report))
 
 

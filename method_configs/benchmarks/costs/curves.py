@@ -86,7 +86,7 @@ def curves(sizes: Sizes, seed: int) -> list[Curve]:
     works = {
         "planning new views": _planning,
         "context for a round of 24": _choosing,
-        "a round: context made ready, 24 views sampled": _round,
+        "a round of 24 views, sampled": _round,
     }
     captures = [
         Curve(name=name, of="captured views", sizes=sizes.views, job=lambda count, work=work: work(int(count), seed))
