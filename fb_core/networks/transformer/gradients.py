@@ -1,4 +1,4 @@
-"""Backward passes of attention and of the root-mean-square norm that a CPU is fast at; the forward passes are torch's.
+"""Attention and the root-mean-square norm as a training on a CPU is fast at them; without gradients they are torch's.
 
 On a CPU torch's own backward of attention in bfloat16 works in small blocks, at a tenth of the speed of a matrix
 product, and that of the norm is put together from a dozen passes over the activations: together a fifth of a training
@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-_MOST_SCORES = 2**22
-"""Scores that are written out at once (16 MB); longer sequences are left to torch, whose memory does not grow with
-them.
+_MOST_SCORES = 2**20
+"""Scores that are kept for the backward pass, 6 bytes each; longer sequences are left to torch, whose memory does not
+grow with them.
 """
 
 
@@ -40,23 +40,25 @@ def rms_normed(x: Float[Tensor, "*batch d"], weight: Float[Tensor, "d"], eps: fl
 
 
 class _Attended(torch.autograd.Function):
-    """Attention whose backward pass writes the weights out, with softmax and scores in float32."""
+    """Attention that keeps its weights, with scores and softmax in float32."""
 
     @staticmethod
     def forward(ctx: Any, queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
-        ctx.save_for_backward(queries, keys, values)
-        return F.scaled_dot_product_attention(queries, keys, values)
+        scale = queries.shape[-1] ** -0.5
+        with torch.autocast(queries.device.type, enabled=False):
+            weights = torch.softmax((queries.float() * scale) @ keys.float().mT, dim=-1)
+            rounded = weights.to(queries.dtype)
+            ctx.save_for_backward(queries, keys, values, weights, rounded)
+            return rounded @ values
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        queries, keys, values = ctx.saved_tensors
-        dtype, scale = queries.dtype, queries.shape[-1] ** -0.5
-        weights = torch.softmax((queries.float() * scale) @ keys.float().mT, dim=-1)
-        of_values = weights.to(dtype).mT @ gradient
+        queries, keys, values, weights, rounded = ctx.saved_tensors
+        of_values = rounded.mT @ gradient
         of_weights = (gradient @ values.mT).float()
         of_scores = torch.ops.aten._softmax_backward_data(of_weights, weights, -1, torch.float32)
-        of_scores = of_scores.mul_(scale).to(dtype)
+        of_scores = of_scores.mul_(queries.shape[-1] ** -0.5).to(queries.dtype)
         return of_scores @ keys, of_scores.mT @ queries, of_values
 
 
