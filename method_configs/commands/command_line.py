@@ -25,6 +25,7 @@ from method_configs.benchmarks.costs.command import Costs
 from method_configs.benchmarks.fit import Fit
 from method_configs.benchmarks.inference import Inference
 from method_configs.benchmarks.methods import Methods
+from method_configs.benchmarks.photos.command import Photos
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
@@ -221,6 +222,7 @@ def bench(
         | Annotated[Paper, tyro.conf.subcommand("paper")]
         | Annotated[Builds, tyro.conf.subcommand("builds")]
         | Annotated[Costs, tyro.conf.subcommand("costs")]
+        | Annotated[Photos, tyro.conf.subcommand("photos")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""
