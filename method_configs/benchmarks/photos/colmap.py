@@ -31,9 +31,10 @@ def cameras_by_colmap(
     camera_mode = colmap.CameraMode.SINGLE if one_size else colmap.CameraMode.AUTO
     with tempfile.TemporaryDirectory(prefix="fillerbuster-colmap-") as folder:
         pictures, database, models = (Path(folder) / name for name in ("images", "database.db", "models"))
+        for made in (pictures, models):
+            made.mkdir()
         for number, photo in enumerate(photos):
             media.write_image(pictures / f"{number:05d}.png", photo.load())
-        models.mkdir()
         marks = [clocks()]
         colmap.extract_features(
             database, pictures, camera_mode=camera_mode, extraction_options=extraction, device=colmap.Device.cpu
