@@ -4,6 +4,8 @@ these files).
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import math
 import os
@@ -81,20 +83,47 @@ class Report:
         return path
 
 
-def median_seconds(jobs: Mapping[str, Callable[[], object]], runs: int, *, warm_up: bool = True) -> dict[str, float]:
-    """Median wall-clock time of each job. Every run does all jobs in turn, so that a busy moment of the machine meets
-    all of them.
+def median_seconds(
+    jobs: Mapping[str, Callable[[], object]],
+    runs: int,
+    *,
+    warm_up: bool = True,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
+    """Median time of each job, by default by the clock on the wall. Every run does all jobs in turn, so that a busy
+    moment of the machine meets all of them.
     """
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for run in range(runs + warm_up):
         for name, job in jobs.items():
-            begin = time.perf_counter()
+            begin = clock()
             job()
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
             if run >= warm_up:
-                times[name].append(time.perf_counter() - begin)
+                times[name].append(clock() - begin)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def peak_megabytes(job: Callable[[], object]) -> float:
+    """Most resident memory of a job beyond what this process held before it, MB; NaN where the system does not tell
+    (not Linux).
+    """
+    gc.collect()
+    try:
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+    except (OSError, AttributeError):
+        return float("nan")
+    before = _status("VmRSS")
+    job()
+    return (_status("VmHWM") - before) / 1024
+
+
+def _status(name: str) -> int:
+    """An entry of the process' status, kB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name + ":"))
 
 
 def relative_difference(got: torch.Tensor, wanted: torch.Tensor) -> float:

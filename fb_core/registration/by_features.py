@@ -5,18 +5,22 @@ straightened.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 
 from fb_core.data.photos.photo import Photo
 from fb_core.data.photos.straight_photos import straightened
 from fb_core.geometry.features.chain import FeatureCameras, chain
-from fb_core.geometry.features.pairs import features_of
+from fb_core.geometry.features.pairs import ALL_PAIRS, PhotoFeatures, features_of
 from fb_core.geometry.similarity import Similarity
+from fb_core.machine.parallel import in_order, workers_for
 from fb_core.registration.by_raymaps import lens_in_words
 
 LONGEST_SIDE = 1024
 """Pixels at which features are looked for."""
+_BYTES_OF_DETECTION = 2.5e8  # of a photo of that side: pyramids of twice its size in float32
+_BYTES_PER_PIXEL = 50.0  # of a photo at full size while it is read and shrunk
 
 
 def recover_with_features(
@@ -29,14 +33,16 @@ def recover_with_features(
     no scale; then the farthest camera is at distance 1 of the middle, in the unit of the known world. Photos whose lens
     bends are returned straightened, by their number; their cameras are those of the straight photos.
     """
+    largest = max((photo.size[0] * photo.size[1] for photo in photos), default=0)
+    found = in_order(
+        partial(_features_of, coarse=len(photos) > ALL_PAIRS),
+        photos,
+        workers_for(len(photos), _BYTES_OF_DETECTION + _BYTES_PER_PIXEL * largest),
+    )
     features = []
-    for number, photo in enumerate(photos):
+    for number, of_photo in enumerate(found):
         on_progress("looking for features", number, len(photos))
-        image, mask = photo.load_with_mask(LONGEST_SIDE)
-        shrink = image.shape[2] / photo.size[1]
-        focal = None if photo.focal_prior is None else photo.focal_prior * shrink
-        lens = {"lens": lens_in_words(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
-        features.append(features_of(image, mask, focal=focal, **lens))
+        features.append(of_photo)
     recovered = chain(features, on_progress=on_progress)
     whole = [
         camera if camera is None else camera.scaled(photo.size[1], photo.size[0])
@@ -61,3 +67,11 @@ def recover_with_features(
         for side in zip(*pairs, strict=True)
     )
     return recovered, Similarity.between(first, second, scale_of_one_place=1 / extent if extent > 0 else 1.0), straight
+
+
+def _features_of(photo: Photo, *, coarse: bool) -> PhotoFeatures:
+    """Features of a photo that is shrunk to `LONGEST_SIDE`; the picture is not kept."""
+    image, mask = photo.load_with_mask(LONGEST_SIDE)
+    focal = None if photo.focal_prior is None else photo.focal_prior * (image.shape[2] / photo.size[1])
+    lens = {"lens": lens_in_words(photo), "same_lens": bool(photo.device), "posed": photo.camera is not None}
+    return features_of(image, mask, focal=focal, coarse=coarse, **lens)

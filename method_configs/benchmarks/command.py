@@ -25,6 +25,7 @@ _ALWAYS_SHOWN = (
     *("capture", "rra_2", "rra_5", "rra_10", "median_degrees", "failed", "still_5"),
     *("model", "normals", "psnr", "ssim", "lpips", "val", "device", "how", "paper_a100_seconds"),
     *("design", "psnr_sample_gain", "psnr_sample_spread", "val_gain", "val_spread"),
+    *("threads", "features_seconds", "matches_seconds", "cameras_seconds", "equal_to_one_thread"),
     *("build", "times_as_fast", "psnr_gain", "psnr_gain_error"),
     *("case", "cpu_seconds", "rotation_degrees_median", "rotation_degrees_max", "plain_rotation_degrees_median"),
 )

@@ -21,9 +21,11 @@ from fb_core.files.ownership import require_own_or_new
 from fb_core.machine.interruption import DEBUG_VARIABLE, ENDED_BY_USER, signals_given_back, stop_on_signals
 from method_configs.benchmarks.builds import Builds
 from method_configs.benchmarks.command import Networks, Precision
+from method_configs.benchmarks.costs.command import Costs
 from method_configs.benchmarks.fit import Fit
 from method_configs.benchmarks.inference import Inference
 from method_configs.benchmarks.methods import Methods
+from method_configs.benchmarks.photos.command import Photos
 from method_configs.benchmarks.poses.command import Poses
 from method_configs.benchmarks.sampler.command import Sampler
 from method_configs.benchmarks.splats.command import Splat
@@ -219,6 +221,8 @@ def bench(
         | Annotated[Inference, tyro.conf.subcommand("inference")]
         | Annotated[Paper, tyro.conf.subcommand("paper")]
         | Annotated[Builds, tyro.conf.subcommand("builds")]
+        | Annotated[Costs, tyro.conf.subcommand("costs")]
+        | Annotated[Photos, tyro.conf.subcommand("photos")]
     ],
 ) -> None:
     """Measure time, memory and error on this machine."""

@@ -18,9 +18,11 @@ from fb_core.geometry.features.own_lens import LensTrial
 from fb_core.geometry.features.pairs import Pair, PhotoFeatures, match_pairs, verified_pair
 from fb_core.geometry.features.panorama import panorama_of
 from fb_core.geometry.features.reconstruction import LEAST_ANGLE_DEGREES, Matches, Reconstruction
+from fb_core.machine.parallel import in_order, workers_for
 
 _GUESSES = (FOCAL_GUESS, 0.7)  # the second is a phone's (26 mm on film)
 _PANORAMA = 0.8  # share of all matches that rotations alone explain, from which nothing else is looked for
+_BYTES = 5e6  # that verifying a pair takes at most
 _STARTS = 3  # pairs that may begin
 _GOOD_ANGLE_DEGREES = 8.0  # of a starting pair; wider ones are no better
 _OUTLIER = 3.0  # tolerances
@@ -119,9 +121,10 @@ def _reconstructed(
 ) -> Reconstruction | None:
     """The best of a few beginnings; None if no two photos make one."""
     focal, bend = lenses.focal[lenses.lens].tolist(), lenses.bend[lenses.lens]
-    pairs = [
-        pair for key, value in matches.items() if (pair := verified_pair(photos, key, value, focal, bend)) is not None
-    ]
+    verified = in_order(
+        lambda match: verified_pair(photos, *match, focal, bend), matches.items(), workers_for(len(matches), _BYTES)
+    )
+    pairs = [pair for pair in verified if pair is not None]
     best: Reconstruction | None = None
     apart = [pair for pair in pairs if pair.parallax_degrees >= LEAST_ANGLE_DEGREES]
     for start in sorted(apart, key=_worth, reverse=True)[:_STARTS]:

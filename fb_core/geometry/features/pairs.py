@@ -12,13 +12,16 @@ from torch import Tensor
 
 from fb_core.geometry.features.bundle_adjustment import straight_places
 from fb_core.geometry.features.triangulation import detect, mutual_matches
+from fb_core.machine.parallel import in_order, workers_for
 from fb_core.masks import resampled
 
 _COARSE_SIDE, _COARSE_LIMIT = 320, 400  # small copies of photos that tell which of them are worth matching
 FEATURES = 2500
 """Of one photo at most."""
-_ALL_PAIRS = 16  # photos of which every pair is matched
+ALL_PAIRS = 16
+"""Photos of which every pair is matched; of more, small copies tell which pairs are worth it."""
 _PARTNERS = 12  # of each photo when there are more
+_BYTES_PER_MATCH = 16.0  # of two photos' features: their similarity, and what finds the largest of it
 _RATIO = 0.8  # most distance to a match, as a share of that to the second likeliest (ratio test of Lowe 2004)
 _IN_FRONT = 0.8  # least share of the matches on epipolar lines whose points lie in front of both cameras
 FEWEST_MATCHES = 16
@@ -67,10 +70,29 @@ def features_of(
     lens: str,
     same_lens: bool = False,
     posed: bool = False,
+    coarse: bool = True,
 ) -> PhotoFeatures:
-    """Features of a photo, RGB in [0, 1]; `known` is 1 where it may be used. The camera of a `posed` photo is known."""
+    """Features of a photo, RGB in [0, 1]; `known` is 1 where it may be used. The camera of a `posed` photo is known.
+
+    Without `coarse` those of a small copy are left out, which nobody asks for among up to `ALL_PAIRS` photos.
+    """
     size = (image.shape[1], image.shape[2])
     places, descriptors, _ = detect(image, known, limit=FEATURES)
+    return PhotoFeatures(
+        places=places,
+        descriptors=descriptors,
+        coarse=_coarse(image, known) if coarse else descriptors[:0],
+        size=size,
+        focal=focal,
+        lens=lens,
+        same_lens=same_lens,
+        known=posed,
+    )
+
+
+def _coarse(image: Float[Tensor, "3 h w"], known: Float[Tensor, "1 h w"] | None) -> Float[Tensor, "c d"]:
+    """Descriptors of a small copy of a photo."""
+    size = image.shape[1:]
     shrink = min(1.0, _COARSE_SIDE / max(size))
     small = [max(1, round(side * shrink)) for side in size]
     everything = torch.ones_like(image[:1])
@@ -79,17 +101,7 @@ def features_of(
         return torch.nn.functional.interpolate(channels[None], size=small, mode="bilinear", antialias=True)[0]
 
     small_image, share = resampled(image, everything if known is None else known, shrunk)
-    coarse = detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
-    return PhotoFeatures(
-        places=places,
-        descriptors=descriptors,
-        coarse=coarse,
-        size=size,
-        focal=focal,
-        lens=lens,
-        same_lens=same_lens,
-        known=posed,
-    )
+    return detect(small_image, None if known is None else (share > 0.5).float(), limit=_COARSE_LIMIT)[1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +122,7 @@ class Pair:
 
 def pairs_at_most(count: int) -> int:
     """How many pairs of so many photos are matched at most."""
-    return count * (min(count, _ALL_PAIRS) - 1) // 2 if count <= _ALL_PAIRS else count * _PARTNERS
+    return count * (min(count, ALL_PAIRS) - 1) // 2 if count <= ALL_PAIRS else count * _PARTNERS
 
 
 def candidate_pairs(photos: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
@@ -118,7 +130,7 @@ def candidate_pairs(photos: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
     copies.
     """
     count = len(photos)
-    if count <= _ALL_PAIRS:
+    if count <= ALL_PAIRS:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
     alike = torch.zeros(count, count)
     for i in range(count):
@@ -142,20 +154,26 @@ def match_pairs(
     """
     matches_of_pair: dict[tuple[int, int], np.ndarray] = {}
     pairs = candidate_pairs(photos)
-    for number, (i, j) in enumerate(pairs):
+    most = max((len(photo.places) for photo in photos), default=0)
+    found = in_order(lambda pair: _matched(photos, *pair), pairs, workers_for(len(pairs), _BYTES_PER_MATCH * most**2))
+    for number, (pair, matches) in enumerate(zip(pairs, found, strict=True)):
         on_pair(number, len(pairs))
-        if min(len(photos[i].places), len(photos[j].places)) < FEWEST_MATCHES:
-            continue
-        rows, columns = mutual_matches(photos[i].descriptors @ photos[j].descriptors.T, ratio=_RATIO)
-        matches = torch.stack([rows, columns], dim=1).numpy()
-        if len(matches) < FEWEST_MATCHES:
-            continue
-        first, second = photos[i].offsets[matches[:, 0]], photos[j].offsets[matches[:, 1]]
-        tolerance = max(photos[i].tolerance, photos[j].tolerance)
-        inliers = _on_epipolar_lines(first, second, tolerance)
-        if inliers.sum() >= FEWEST_MATCHES:
-            matches_of_pair[i, j] = matches[inliers]
+        if matches is not None:
+            matches_of_pair[pair] = matches
     return matches_of_pair
+
+
+def _matched(photos: Sequence[PhotoFeatures], i: int, j: int) -> Int[np.ndarray, "m 2"] | None:
+    """The matches of a pair that one fundamental matrix explains; None where they are too few."""
+    if min(len(photos[i].places), len(photos[j].places)) < FEWEST_MATCHES:
+        return None
+    rows, columns = mutual_matches(photos[i].descriptors @ photos[j].descriptors.T, ratio=_RATIO)
+    matches = torch.stack([rows, columns], dim=1).numpy()
+    if len(matches) < FEWEST_MATCHES:
+        return None
+    first, second = photos[i].offsets[matches[:, 0]], photos[j].offsets[matches[:, 1]]
+    inliers = _on_epipolar_lines(first, second, max(photos[i].tolerance, photos[j].tolerance))
+    return matches[inliers] if inliers.sum() >= FEWEST_MATCHES else None
 
 
 def verified_pair(

@@ -128,11 +128,11 @@ def mutual_matches(similar: Float[Tensor, "k l"], *, ratio: float) -> tuple[Int[
     descriptors).
     """
     best, partner = similar.topk(2, dim=1)
-    back = similar.argmax(dim=0)
-    mutual = back[partner[:, 0]] == torch.arange(len(similar))
     distance = (2 - 2 * best).clamp(min=0).sqrt()
-    chosen = mutual & (best[:, 0] > _LEAST_SIMILARITY) & (distance[:, 0] < ratio * distance[:, 1])
-    return chosen.nonzero()[:, 0], partner[chosen, 0]
+    clear = (best[:, 0] > _LEAST_SIMILARITY) & (distance[:, 0] < ratio * distance[:, 1])
+    rows, columns = clear.nonzero()[:, 0], partner[clear, 0]
+    mutual = similar[:, columns].argmax(dim=0) == rows  # of these columns alone: a column is far apart in memory
+    return rows[mutual], columns[mutual]
 
 
 def nearest_points(

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from fb_core.networks.transformer.embeddings import at_least_float32
+from fb_core.networks.transformer.gradients import attended, rms_normed
 from fb_core.networks.transformer.ray_frames import RayFrames, transformed
 
 EPS = 1e-5
@@ -26,7 +26,7 @@ class RMSNorm(nn.Module):
     def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         """Same shape; float32 for half-precision inputs."""
         dtype = at_least_float32(x.dtype)
-        return F.rms_norm(x.to(dtype), self.weight.shape, self.weight.to(dtype), EPS)
+        return rms_normed(x.to(dtype), self.weight.to(dtype), EPS)
 
 
 class KeysValues(NamedTuple):
@@ -90,4 +90,4 @@ class Attention(nn.Module):
             queries, context = self.queries_keys_values(x, frames)
         else:
             queries = self.queries(x, context.values.dtype)
-        return self.answered(F.scaled_dot_product_attention(queries, *context), frames)
+        return self.answered(attended(queries, *context), frames)

@@ -130,12 +130,13 @@ class Block(nn.Module):
         `frames` are those of the tokens' rays. A `relation` says whom the tokens attend to instead of one another, and
         in which frames.
         """
-        normed = self.norm1(x, scale_shifts[0])
+        each = scale_shifts.unbind()  # one gradient for all norms; picked one by one, each would make a whole one
+        normed = self.norm1(x, each[0])
         if relation is not None and relation.last is self.attn1:
             relation.keep(self.attn1, normed)
             return x
         x = x + (self.attn1(normed, None, frames) if relation is None else relation.gathered(self.attn1, normed))
         if text is not None:
-            normed = self.norm2(x, scale_shifts[1])
+            normed = self.norm2(x, each[1])
             x = x + (self.attn2(normed, text) if relation is None else relation.read(self.attn2, normed, text))
-        return x + self.ff(self.norm3(x, scale_shifts[-1]))
+        return x + self.ff(self.norm3(x, each[-1]))

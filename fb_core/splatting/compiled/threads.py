@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,12 +14,10 @@ import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-from fb_core.machine.resources import usable_cores
+from fb_core.machine.parallel import free_cores
 
 _ROWS_PER_THREAD = 20_000  # (Gaussian, cell): below these another thread costs more than it saves
 _PARTS_PER_THREAD = 4  # some take longer than others
-_LOOKS_EVERY_SECONDS = 5.0
-_looked: tuple[float, int] = (-1e9, 1)
 _fixed: ContextVar[int | None] = ContextVar("fixed_threads", default=None)
 
 
@@ -66,16 +63,6 @@ def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"]
     edges = [0, *cuts, cells]
     ranges = [(first, last) for first, last in pairwise(edges) if last > first]
     list(_pool(os.getpid(), threads).map(lambda part: work(*part), ranges))
-
-
-def free_cores() -> int:
-    """Cores that this process may use and that nothing else is busy on, 1 at least; looked at every few seconds."""
-    global _looked
-    now = time.monotonic()
-    if now - _looked[0] > _LOOKS_EVERY_SECONDS:
-        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
-        _looked = now, max(1, usable_cores() - max(0, round(load - 1)))  # this process is 1 of the load
-    return _looked[1]
 
 
 @cache

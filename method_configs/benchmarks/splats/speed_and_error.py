@@ -7,8 +7,6 @@ does, by caches and memory that others use. `exp_per_second` says how fast the m
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import os
 import statistics
 import time
@@ -21,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fb_core.evaluation.results import Bar, OnCell, Report
+from fb_core.evaluation.results import Bar, OnCell, Report, peak_megabytes
 from fb_core.splatting.compiled.library import loaded
 from fb_core.splatting.rasterizer import rasterization
 from fb_core.splatting.single_thread import single_thread
@@ -197,25 +195,9 @@ def _errors(got: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, float
 
 
 def _peak_megabytes(draw: Draw, scene: SplatScene) -> float:
-    """Most resident memory of forward and backward beyond the inputs, MB; NaN where the system does not tell (not
-    Linux).
-    """
+    """Most resident memory of forward and backward beyond the inputs, MB."""
     inputs = scene.inputs(gradients=True)
-    gc.collect()
-    try:
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    except (OSError, AttributeError):
-        return float("nan")
-    before = _status("VmRSS")
-    loss_of(*draw(**inputs)).backward()
-    return (_status("VmHWM") - before) / 1024
-
-
-def _status(name: str) -> int:
-    """An entry of the process' status, kB."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(name + ":"))
+    return peak_megabytes(lambda: loss_of(*draw(**inputs)).backward())
 
 
 def _exponentials_per_second() -> float:

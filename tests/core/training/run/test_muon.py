@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from fb_core.training.run.muon import Muon, orthogonalised
+from fb_core.training.run.muon import FOUR, Muon, orthogonalised
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -50,19 +50,45 @@ def test_matrices_of_one_shape_together_equal_each_by_itself():
     )
 
 
+def four_steps(matrices: torch.Tensor) -> torch.Tensor:
+    """What the iteration in bfloat16 rounds: the same polynomials of the singular values, in float64."""
+    left, values, right = torch.linalg.svd(matrices.double(), full_matrices=False)
+    values = values / values.norm(dim=-1, keepdim=True)
+    for a, b, c in FOUR:
+        values = a * values + b * values**3 + c * values**5
+    return left * values[:, None] @ right
+
+
 @pytest.mark.parametrize("shape", [(2, 96, 8), (2, 8, 96), (1, 256, 32)])
 def test_long_matrices_in_bfloat16_go_by_their_small_side_and_closer_to_the_exact_answer(shape):
     matrices = random(*shape)
-    exact = orthogonalised(matrices.double(), torch.float64)
     short = matrices[..., : 5 * min(shape[1:])] if shape[1] < shape[2] else matrices[:, : 5 * min(shape[1:])]
-    plain = orthogonalised(short, torch.bfloat16) - orthogonalised(
-        short.double(), torch.float64
-    )  # not long enough for the small side
+    plain = orthogonalised(short, torch.bfloat16) - four_steps(short)  # not long enough for the small side
     got = orthogonalised(matrices, torch.bfloat16)
     assert got.dtype == torch.float32
-    assert (got - exact).square().mean().sqrt() < plain.square().mean().sqrt()
+    assert (got - four_steps(matrices)).square().mean().sqrt() < plain.square().mean().sqrt()
     torch.testing.assert_close(got.mT, orthogonalised(matrices.mT, torch.bfloat16))
     assert (orthogonalised(torch.zeros(1, 96, 8), torch.bfloat16) == 0).all()
+
+
+@pytest.mark.parametrize("columns", [64, 100, 128, 640])
+@pytest.mark.parametrize("spectrum", ["random", "steep", "steeper", "of rank one", "of rank three", "one and noise"])
+def test_in_bfloat16_singular_values_from_a_three_hundredth_of_the_norm_on_become_about_one(columns, spectrum):
+    size = 64
+    noise = random(1, size, columns, seed=3).double()
+    left, values, right = torch.linalg.svd(noise, full_matrices=False)
+    number = torch.arange(1, size + 1, dtype=torch.float64)
+    if spectrum != "random":
+        few = {"of rank one": 1, "of rank three": 3, "one and noise": 1}
+        shaped = number**-1.0 if spectrum == "steep" else number**-2.0
+        values = ((number <= few[spectrum]).double() if spectrum in few else shaped)[None]
+    matrix = left * values[:, None] @ right + (1e-3 * noise if spectrum == "one and noise" else 0)
+    left, values, right = torch.linalg.svd(matrix, full_matrices=False)
+    got = orthogonalised(matrix.float(), torch.bfloat16).double()
+    large = values[0] / values.norm() > 1 / 300
+    along = (left.mT @ got @ right.mT)[0].diagonal()[large]
+    assert 0.75 < float(along.min()) and float(along.max()) < 1.25
+    assert float(torch.linalg.matrix_norm(got, 2)) < 1.3, "and none leaves the range"
 
 
 def test_a_step_has_the_size_that_adamw_takes():
