@@ -11,7 +11,8 @@ import torch
 from helpers.textured_box import cameras_on_an_arc, save_photos
 
 from method_configs.benchmarks.photos.colmap import camera_of
-from method_configs.benchmarks.photos.command import STAGES, Photos, between
+from method_configs.benchmarks.photos.command import Photos
+from method_configs.benchmarks.photos.stages import STAGES, between
 
 
 def test_stages_last_from_one_beginning_to_the_next():

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from method_configs.benchmarks.photos.stages import between, clocks
+
 if TYPE_CHECKING:
     from fb_core.data.photos.photo import Photo
     from fb_core.geometry.cameras import Pinholes
@@ -20,7 +22,6 @@ def cameras_by_colmap(
     stage.
     """
     from fb_core.data import media
-    from method_configs.benchmarks.photos.command import between, clocks
 
     colmap: Any = importlib.import_module("pycolmap")
     extraction, matching = colmap.FeatureExtractionOptions(), colmap.FeatureMatchingOptions()

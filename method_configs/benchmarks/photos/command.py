@@ -7,12 +7,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from method_configs.benchmarks.photos.stages import STAGES, between, clocks
 from method_configs.benchmarks.table_files import TableFiles
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from fb_core.evaluation.results import Report
     from fb_core.geometry.cameras import Pinholes
 
-STAGES = ("features", "matches", "cameras")
-"""Reading photos and finding features; matching them; all else."""
 _logger = logging.getLogger(__name__)
 
 
@@ -107,23 +105,6 @@ def cameras_by_features(
     with fixed_workers(threads):
         cameras = recover_with_features(photos, on_progress=note)[0].cameras
     return cameras, between([*(began.get(stage) for stage in STAGES), clocks()])
-
-
-def clocks() -> tuple[float, float]:
-    """Seconds by the clock, and of this process on processors."""
-    return time.perf_counter(), time.process_time()
-
-
-def between(marks: Sequence[tuple[float, float] | None]) -> dict[str, tuple[float, float]]:
-    """Seconds of each stage from the moments at which they began, and the end; a stage that never began took none."""
-    known: list[tuple[float, float]] = []
-    for mark in reversed(marks):
-        known.append(known[-1] if mark is None else mark)
-    known.reverse()
-    return {
-        stage: (known[number + 1][0] - known[number][0], known[number + 1][1] - known[number][1])
-        for number, stage in enumerate(STAGES)
-    }
 
 
 def _equal(first: Sequence[Pinholes | None], second: Sequence[Pinholes | None]) -> bool:
