@@ -7,23 +7,8 @@
  *
  * Exponents are to the base 2. A cell has 8 x 4 pixels, or 4 x 4; LANES of them are worked on at once.
  */
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
+#include "vectors.h"
 
-#ifdef DOUBLE
-typedef double real;
-typedef int64_t whole;
-#define BYTES 8
-#else
-typedef float real;
-typedef int32_t whole;
-#define BYTES 4
-#endif
-#define ROUNDED(function, x) ((real)(BYTES == 8 ? function(x) : function##f((float)(x))))
-#define FLOOR(x) ROUNDED(floor, x)
-#define CEIL(x) ROUNDED(ceil, x)
-#define SQRT(x) ROUNDED(sqrt, x)
 #ifdef __AVX512F__
 #define LANES (64 / BYTES)
 #else
@@ -35,9 +20,7 @@ typedef int32_t whole;
 #define GEOMETRY 6 /* columns of a row of the table before the values */
 #define AHEAD 6 /* Gaussians whose rows are on their way to the cache */
 #define STOP ((real)1e-4)
-#define HALF ((real)0.5)
 #define LOG_2 ((real)0.69314718055994531)
-#define ALWAYS static inline __attribute__((always_inline))
 
 typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
 typedef whole ivec __attribute__((vector_size(LANES * sizeof(real))));

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from fb_core.splatting.compiled.library import loaded
+from fb_core.splatting.compiled.library import library_for, loaded
 from fb_core.splatting.compiled.threads import in_parts, threads_for
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.tiles.blocks import Table, table_of
@@ -59,9 +59,9 @@ class Lists:
     starts: Int32[Tensor, " cells+1"]
 
 
-def can_composite(values: Float[Tensor, "v d"]) -> bool:
-    """Whether a library for such values has been made."""
-    return values.device.type == "cpu" and values.shape[1] <= MOST_CHANNELS and loaded(values.dtype) is not None
+def can_draw(channels: int, like: Tensor) -> bool:
+    """Whether a library for so many channels of such numbers has been made."""
+    return like.device.type == "cpu" and channels <= MOST_CHANNELS and loaded(like.dtype) is not None
 
 
 def composite_compiled(
@@ -72,20 +72,13 @@ def composite_compiled(
     ellipses: Ellipses,
     settings: CompositingSettings,
 ) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
-    """As `tiles.compositing.composite`; the library must have been made (`can_composite`)."""
+    """As `tiles.compositing.composite`; the library must have been made (`can_draw`)."""
     return _Compiled.apply(means2d, conics, opacities, values, ellipses, settings)
-
-
-def _library(dtype: torch.dtype) -> ctypes.CDLL:
-    library = loaded(dtype)
-    if library is None:
-        raise ValueError(f"no compiled library for {dtype}: run `fillerbuster compile`, or draw with torch.")
-    return library
 
 
 def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Float[Tensor, "cells p"]) -> Lists:
     """The lists of one run of Gaussians, without the cells that the runs before have made opaque."""
-    library, grid = _library(light.dtype), ellipses.grid
+    library, grid = library_for(light.dtype), ellipses.grid
     bounds = (None, None) if ellipses.bounds is None else (ellipses.bounds[0], ellipses.bounds[1])
     columns = [
         ellipses.x, ellipses.y, strips.skew, strips.over_A, strips.over_yy, strips.reach, strips.turn,
@@ -143,7 +136,7 @@ class _Run:
 class _Compiled(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means2d, conics, opacities, values, ellipses: Ellipses, settings: CompositingSettings):
-        library, runs, grid = _library(values.dtype), list[_Run](), ellipses.grid
+        library, runs, grid = library_for(values.dtype), list[_Run](), ellipses.grid
         needed = any(ctx.needs_input_grad[:4])
         pixels = grid.cell_width * grid.cell_height
         with single_thread():
@@ -176,7 +169,7 @@ class _Compiled(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor, v_alphas: Tensor):  # type: ignore[override]
         means2d, conics, opacities, values = ctx.saved_tensors
         ellipses, grid, settings, table = ctx.ellipses, ctx.ellipses.grid, ctx.settings, ctx.table
-        library, channels = _library(values.dtype), values.shape[1]
+        library, channels = library_for(values.dtype), values.shape[1]
         with single_thread():
             upstream = to_cells([v_colors, v_alphas], grid)
             behind = upstream.new_zeros(grid.count, upstream.shape[2])

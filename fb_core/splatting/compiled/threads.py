@@ -68,6 +68,16 @@ def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"]
     list(_pool(os.getpid(), threads).map(lambda part: work(*part), ranges))
 
 
+def in_ranges(work: Callable[[int, int], None], number: int, threads: int) -> None:
+    """``work(first, last)`` for ranges that together are 0 to ``number``, about as many as threads; see `in_parts`."""
+    parts = min(threads, number)
+    if parts <= 1:
+        work(0, number)
+        return
+    edges = [number * part // parts for part in range(parts + 1)]
+    list(_pool(os.getpid(), threads).map(lambda part: work(*part), pairwise(edges)))
+
+
 def free_cores() -> int:
     """Cores that this process may use and that nothing else is busy on, 1 at least; looked at every few seconds."""
     global _looked
