@@ -40,7 +40,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.files.limits import MOST_PIXELS
-from fb_core.splatting.compiled.compositing import MOST_CHANNELS, can_draw, composite_compiled
+from fb_core.splatting.compiled.compositing import MOST_CHANNELS, Chosen, can_draw, composite_compiled
 from fb_core.splatting.compiled.projection import project_compiled
 from fb_core.splatting.projection import ALPHA_MIN, SEMANTICS, Gaussians, Projection, ProjectionSettings, project_splats
 from fb_core.splatting.single_thread import single_thread
@@ -139,11 +139,16 @@ def _drawn(
         height=settings.height,
         cell_width=CELL_WIDTH if tile_size % CELL_WIDTH == 0 else 4,
     )
-    ellipses = _ellipses(projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid)
+    boxes = settings.semantics.square_boxes
     compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=look.absgrad)
-    images, alphas = (composite_compiled if compiled else composite)(
-        projection.means2d, projection.conics, opacities, values, ellipses, compositing
-    )
+    drawn = projection.means2d, projection.conics, opacities, values
+    if compiled:
+        radii = projection.radii if boxes else None
+        seen = Chosen(ranks=chosen, determinants=projection.determinants, radii=radii, tile_size=tile_size, grid=grid)
+        images, alphas = composite_compiled(*drawn, seen, compositing)
+    else:
+        ellipses = _ellipses(projection, opacities, chosen, tile_size if boxes else None, grid)
+        images, alphas = composite(*drawn, ellipses, compositing)
     images = _finish(images, alphas, look.backgrounds, look.render_mode)
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
 

@@ -1,4 +1,4 @@
-"""The compiled drawing of splats (the C files beside this one): made once by `fillerbuster compile`, then found and loaded.
+"""The compiled drawing of splats (the C files here): made once by `fillerbuster compile`, then found and loaded.
 
 Nothing is compiled unasked. The library lies in the user's own cache folder, under a name that says from what it was
 made (source, options, processor), so that another version of this package or another processor never loads it.
@@ -27,6 +27,10 @@ CACHE_VARIABLE = "FILLERBUSTER_CACHE"
 """Environment variable: folder of compiled libraries, instead of the system's usual place."""
 _OPTIONS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 _DEFINES = {torch.float32: (), torch.float64: ("-DDOUBLE",)}
+_FUNCTIONS = (
+    "fb_project", "fb_project_backward", "fb_spans", "fb_count_items", "fb_place_items", "fb_forward", "fb_backward",
+    "fb_gather",
+)  # fmt: skip
 _COMPILERS = ("cc", "gcc", "clang")
 _logger = logging.getLogger(__name__)
 
@@ -99,8 +103,7 @@ def loaded(dtype: torch.dtype) -> ctypes.CDLL | None:
         return None
     try:
         library = ctypes.CDLL(str(path))
-        library.fb_strips.restype = ctypes.c_int64
-        for name in ("fb_fill", "fb_forward", "fb_backward", "fb_add_rows", "fb_project", "fb_project_backward"):
+        for name in _FUNCTIONS:
             getattr(library, name).restype = None
     except (OSError, AttributeError):
         _logger.warning("%s cannot be loaded; torch draws. `fillerbuster compile` makes it anew.", path)

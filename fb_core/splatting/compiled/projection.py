@@ -150,7 +150,7 @@ class _CompiledProjection(torch.autograd.Function):
         for number, camera in enumerate(ctx.views):
             incoming = [None if tensor is None else tensor[number] for tensor in upstream]
             view = _camera_gradient(held, (camera, ctx.constants), incoming, radii[number], totals)
-            if view is not None:
+            if view is not None and totals[4] is not None:
                 totals[4][number, :3] = view
         return (*totals, None)
 
