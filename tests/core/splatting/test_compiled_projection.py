@@ -73,7 +73,7 @@ def test_what_does_not_arrive_gives_nothing(compiled_library: Path, parts: tuple
     agree(inputs if by_axes else covariances(inputs), settings_of(inputs), parts)
 
 
-def _changed(**rows: tuple[slice | int, float]) -> dict[str, Any]:
+def _changed(**rows: tuple[slice | int, float | Tensor]) -> dict[str, Any]:
     """A scene with some rows of the named inputs set to a value."""
     inputs = scene(n=70, cameras=2)
     for name, (at, value) in rows.items():
@@ -160,6 +160,14 @@ def test_several_bands_agree_with_torch(compiled_library: Path) -> None:
     expected = [images, alphas, *(leaves[name].grad for name in INPUTS)]
     for got, wanted in zip([*compiled[:2], *compiled[3:]], expected, strict=True):
         assert relative(got, wanted) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["none", "behind the camera"])
+def test_a_scene_with_nothing_to_see_is_empty(compiled_library: Path, name: str) -> None:
+    inputs = scene(n=0 if name == "none" else 20, cameras=2)
+    inputs["viewmats"][:, 2, 3] -= 100.0
+    images, alphas, *gradients = _drawn(inputs)
+    assert not images.any() and not alphas.any() and not any(gradient.any() for gradient in gradients)
 
 
 def test_precision_and_gradients_follow_the_caller(compiled_library: Path) -> None:
