@@ -37,6 +37,11 @@ _TENSORS = (
     "wide", "logs", "band_items", "band_strips", "band_cells", "ranks", "starts", "places", "table", "strip_cells",
     "strip_wide", "lists", "list_starts", "list_counts", "colors", "alphas", "light_before", "light", "stop",
 )  # fmt: skip
+_FOR_BACKWARD = (
+    "chosen", "conics", "opacities", "band_items", "band_cells", "starts", "places", "table", "lists", "list_starts",
+    "list_counts", "light", "stop",
+)  # fmt: skip
+"""What backward reads. The pictures are not among them: a result that its own graph holds is never freed."""
 
 
 class _Run(ctypes.Structure):
@@ -167,9 +172,12 @@ class _Compiled(torch.autograd.Function):
 
             in_parts(forward, run.held["band_cells"], threads_for(int(run.held["band_cells"][-1])))
             runs.append(run)
+        images = common.held["colors"], common.held["alphas"]
+        for run in runs:
+            run.held = {name: run.held[name] for name in _FOR_BACKWARD}
         ctx.save_for_backward(means2d, conics, opacities, values)
         ctx.settings, ctx.runs = settings, runs if any(ctx.needs_input_grad[:4]) else []
-        return common.held["colors"], common.held["alphas"]
+        return images
 
     @staticmethod
     @once_differentiable

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -13,7 +15,7 @@ import torch
 from helpers.scenes.rasterizer_scenes import INPUTS, backward, relative, scene, with_gradients
 from torch import Tensor
 
-from fb_core.splatting.compiled import threads
+from fb_core.splatting.compiled import compositing, threads
 from fb_core.splatting.compiled.projection import project_compiled
 from fb_core.splatting.compiled.threads import fixed_threads
 from fb_core.splatting.projection import SEMANTICS, Gaussians, ProjectionSettings, project_splats
@@ -207,3 +209,24 @@ def test_own_threads_leave_a_core_free_and_others_do_not(monkeypatch: pytest.Mon
         assert threads.free_cores() == expected, (own, others)
     clock["monotonic"] += 1000  # the last look is too old to tell
     assert threads.free_cores() == 1
+
+
+def test_pictures_without_a_way_back_are_freed(compiled_library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once, without the garbage collector: nothing that the graph holds holds the graph."""
+    tables: list[weakref.ref[Tensor]] = []
+
+    def part(*given: Any) -> Any:
+        run = original(*given)
+        tables.append(weakref.ref(run.held["table"]))
+        return run
+
+    original = compositing._part
+    monkeypatch.setattr(compositing, "_part", part)
+    gc.disable()
+    try:
+        drawn = rasterization(**with_gradients(scene(n=70)), engine="compiled")
+        assert tables[0]() is not None
+        del drawn
+        assert tables[0]() is None
+    finally:
+        gc.enable()
