@@ -4,8 +4,6 @@ thread.
 
 from __future__ import annotations
 
-import os
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,12 +13,11 @@ from typing import TypeVar
 
 import torch
 
-from fb_core.machine.resources import free_memory_bytes, usable_cores
+from fb_core.machine.cores import free_cores
+from fb_core.machine.resources import free_memory_bytes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_LOOKS_EVERY_SECONDS = 5.0
-_looked: tuple[float, int] = (-1e9, 1)
 _fixed: ContextVar[int | None] = ContextVar("fixed_workers", default=None)
 
 
@@ -78,13 +75,3 @@ def in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int
                     future.cancel()
     finally:
         torch.set_num_threads(before)
-
-
-def free_cores() -> int:
-    """Cores that this process may use and that nothing else is busy on, 1 at least; looked at every few seconds."""
-    global _looked
-    now = time.monotonic()
-    if now - _looked[0] > _LOOKS_EVERY_SECONDS:
-        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
-        _looked = now, max(1, usable_cores() - max(0, round(load - 1)))  # this process is 1 of the load
-    return _looked[1]

@@ -23,7 +23,7 @@ Arguments of `rasterization`, whose shapes stand in its signature:
     rasterize_mode: "antialiased" multiplies the opacities by sqrt(det before blur / det after it).
     covars: covariances in place of quats and scales.
     semantics: the version of gsplat to agree with.
-    engine: what lists and composites: torch, the compiled library (see `compiled.library`), or auto: the library where
+    engine: what draws: torch, the compiled library (see `compiled.library`), or auto: the library where
         it has been made and fits (at most 15 channels), else torch. They agree within rounding.
 """
 
@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
@@ -41,7 +40,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fb_core.files.limits import MOST_PIXELS
-from fb_core.splatting.compiled.compositing import MOST_CHANNELS, can_composite, composite_compiled
+from fb_core.splatting.compiled.compositing import MOST_CHANNELS, Chosen, can_draw, composite_compiled
+from fb_core.splatting.compiled.projection import project_compiled
 from fb_core.splatting.projection import ALPHA_MIN, SEMANTICS, Gaussians, Projection, ProjectionSettings, project_splats
 from fb_core.splatting.single_thread import single_thread
 from fb_core.splatting.spherical_harmonics import MAX_DEGREE, sh_colors
@@ -125,7 +125,9 @@ def _drawn(
     usable, dropped = _usable(splats, _used_colors(colors, look.sh_degree, look.render_mode))
     if usable is not None:
         splats = replace(splats, opacities=splats.opacities.masked_fill(~usable, 0.0))
-    projection = project_splats(splats, viewmats, Ks, usable, settings)
+    compiled = _is_compiled(look, colors, splats.means)
+    project = project_compiled if compiled else project_splats
+    projection = project(splats, viewmats, Ks, usable, settings)
     opacities = splats.opacities.expand(viewmats.shape[0], -1)
     if settings.antialiased:
         opacities = opacities * projection.compensations
@@ -137,25 +139,31 @@ def _drawn(
         height=settings.height,
         cell_width=CELL_WIDTH if tile_size % CELL_WIDTH == 0 else 4,
     )
-    ellipses = _ellipses(projection, opacities, chosen, tile_size if settings.semantics.square_boxes else None, grid)
+    boxes = settings.semantics.square_boxes
     compositing = CompositingSettings(alpha_cap=settings.semantics.alpha_cap, absgrad=look.absgrad)
-    images, alphas = _compositor(look.engine, values)(
-        projection.means2d, projection.conics, opacities, values, ellipses, compositing
-    )
+    drawn = projection.means2d, projection.conics, opacities, values
+    if compiled:
+        radii = projection.radii if boxes else None
+        seen = Chosen(ranks=chosen, determinants=projection.determinants, radii=radii, tile_size=tile_size, grid=grid)
+        images, alphas = composite_compiled(*drawn, seen, compositing)
+    else:
+        ellipses = _ellipses(projection, opacities, chosen, tile_size if boxes else None, grid)
+        images, alphas = composite(*drawn, ellipses, compositing)
     images = _finish(images, alphas, look.backgrounds, look.render_mode)
     return images, alphas, _meta(projection, opacities, settings, tile_size, dropped)
 
 
-def _compositor(engine: Engine, values: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
-    """What composites such values."""
-    if engine == "torch" or (engine == "auto" and not can_composite(values)):
-        return composite
-    if not can_composite(values):
+def _is_compiled(look: _Look, colors: Tensor, means: Tensor) -> bool:
+    """Whether the compiled library draws. Raises ValueError where it should but cannot."""
+    channels = 0 if look.render_mode in ("D", "ED") else colors.shape[-1]
+    channels += look.render_mode != "RGB"
+    fits = can_draw(channels, means)
+    if look.engine == "compiled" and not fits:
         raise ValueError(
-            f"engine: expected torch or auto for {values.shape[1]} channels of {values.dtype} on {values.device}, got "
+            f"engine: expected torch or auto for {channels} channels of {means.dtype} on {means.device}, got "
             f"compiled, which takes up to {MOST_CHANNELS} channels on the CPU once `fillerbuster compile` has run."
         )
-    return composite_compiled
+    return fits and look.engine != "torch"
 
 
 def _used_colors(colors: Tensor, sh_degree: int | None, render_mode: RenderMode) -> Tensor | None:

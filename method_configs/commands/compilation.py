@@ -1,4 +1,4 @@
-"""``fillerbuster compile``: the compositing of splats as a library of this machine, tried before it is used."""
+"""``fillerbuster compile``: the drawing of splats as a library of this machine, tried before it is used."""
 
 from __future__ import annotations
 

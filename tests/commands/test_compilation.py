@@ -38,11 +38,12 @@ def test_a_library_that_draws_something_else_is_removed(
     """As a compiler with a fault would make it; here the source says that pixels stop earlier."""
     if library.compiler_here() is None:
         pytest.skip("no C compiler here")
-    wrong = tmp_path / "wrong.c"
-    text = library.SOURCE.read_text(encoding="utf-8")
-    wrong.write_text(text.replace("#define STOP ((real)1e-4)", "#define STOP ((real)0.3)"), encoding="utf-8")
-    assert wrong.read_text(encoding="utf-8") != text
-    monkeypatch.setattr(library, "SOURCE", wrong)
+    for source in library.SOURCES:
+        text = source.read_text(encoding="utf-8")
+        changed = text.replace("#define STOP ((real)1e-4)", "#define STOP ((real)0.3)")
+        assert (changed != text) == (source.name == "compositing.c")
+        (tmp_path / source.name).write_text(changed, encoding="utf-8")
+    monkeypatch.setattr(library, "SOURCES", tuple(tmp_path / source.name for source in library.SOURCES))
     with pytest.raises(library.NoCompiler, match="draws what torch draws"):
         compile_splats()
     library.loaded.cache_clear()

@@ -1,29 +1,13 @@
-/* Lists of Gaussians by cell and their compositing, forward and backward: what ../tiles does with torch, in one pass.
+/* Compositing, forward and backward: what ../tiles does with torch, in one pass.
  *
- * Plain C for gcc or clang, no header of Python or torch; `library.py` compiles it where there is a compiler. Every
- * function works on a range of cells and writes nothing that belongs to another range, so that any number of threads
- * gives the same bits. Rules per pixel as in ../tiles/blocks.py: skip alpha < 1/255, cap alpha, stop before the
- * Gaussian that would bring the transmittance to 1e-4 or below.
+ * Plain C for gcc or clang, no header of Python or torch; `library.py` compiles it where there is a compiler. Rules per
+ * pixel as in ../tiles/blocks.py: skip alpha < 1/255, cap alpha, stop before the Gaussian that would bring the
+ * transmittance to 1e-4 or below.
  *
  * Exponents are to the base 2. A cell has 8 x 4 pixels, or 4 x 4; LANES of them are worked on at once.
  */
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
+#include "run.h"
 
-#ifdef DOUBLE
-typedef double real;
-typedef int64_t whole;
-#define BYTES 8
-#else
-typedef float real;
-typedef int32_t whole;
-#define BYTES 4
-#endif
-#define ROUNDED(function, x) ((real)(BYTES == 8 ? function(x) : function##f((float)(x))))
-#define FLOOR(x) ROUNDED(floor, x)
-#define CEIL(x) ROUNDED(ceil, x)
-#define SQRT(x) ROUNDED(sqrt, x)
 #ifdef __AVX512F__
 #define LANES (64 / BYTES)
 #else
@@ -31,13 +15,9 @@ typedef int32_t whole;
 #endif
 #define MOST_CHANNELS 16 /* values and alpha */
 #define MOST_VECTORS (32 / LANES)
-#define PULLS 8 /* moments and the two absolute pulls: columns of a row of gradients before the values */
-#define GEOMETRY 6 /* columns of a row of the table before the values */
 #define AHEAD 6 /* Gaussians whose rows are on their way to the cache */
 #define STOP ((real)1e-4)
-#define HALF ((real)0.5)
 #define LOG_2 ((real)0.69314718055994531)
-#define ALWAYS static inline __attribute__((always_inline))
 
 typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
 typedef whole ivec __attribute__((vector_size(LANES * sizeof(real))));
@@ -47,7 +27,7 @@ ALWAYS void store(real *to, vec v) { memcpy(to, &v, sizeof v); }
 ALWAYS vec splat(real x) { return x - (vec){0}; }
 ALWAYS vec where(ivec yes, vec a) { return (vec)((ivec)a & yes); } /* a or 0 */
 ALWAYS vec choose(ivec yes, vec a, vec b) { return (vec)(((ivec)a & yes) | ((ivec)b & ~yes)); }
-ALWAYS vec absolute(vec a) { return (vec)((ivec)a & ~((whole)1 << (8 * sizeof(real) - 1))); }
+ALWAYS vec absolute(vec a) { return (vec)((ivec)a & ~(whole)((uint64_t)1 << (8 * sizeof(real) - 1))); }
 ALWAYS int any(ivec m) { whole e = 0; for (int l = 0; l < LANES; l++) e |= m[l]; return e != 0; }
 
 /* 2^x: the power series on [-1/2, 1/2], and the whole part into the exponent. Below 2^-126 it stays there. */
@@ -72,18 +52,10 @@ ALWAYS vec power_of_2(vec x) {
     return (vec)((ivec)p + ((ivec)rounded << mantissa));
 }
 
-typedef struct {
-    const real *table;   /* [v, stride]: log2(opacity), x, y, A, B, C (times log2 e), values, 1 */
-    int32_t stride, channels; /* channels: values and the 1 */
-    const int32_t *splats, *starts; /* of cell k: splats[starts[k]] to splats[starts[k + 1] - 1], near ones first */
-    int32_t columns, rows, cell_width, cell_height; /* cells in a row, rows of cells in a picture; pixels */
-    double below, cap; /* alpha at or under `below` is skipped, above `cap` cut */
-} Scene;
-
 /* The exponents' polynomial about the centre of a cell, and u, v of its pixels. */
 typedef struct { vec u[MOST_VECTORS], v[MOST_VECTORS]; int vectors; } Pixels;
 
-ALWAYS Pixels pixels_of(const Scene *s) {
+ALWAYS Pixels pixels_of(const Run *s) {
     Pixels p;
     p.vectors = s->cell_width * s->cell_height / LANES;
     for (int i = 0; i < p.vectors; i++)
@@ -112,31 +84,75 @@ ALWAYS vec exponent_at(const Polynomial *k, vec u, vec v) {
     return along * u + ((k->k5 * v + k->k2) * v + k->k0);
 }
 
-ALWAYS void centre_of(const Scene *s, int64_t cell, real *x, real *y) {
+ALWAYS void centre_of(const Run *s, int64_t cell, real *x, real *y) {
     int64_t in_picture = cell % ((int64_t)s->columns * s->rows);
     *x = (in_picture % s->columns + HALF) * s->cell_width;
     *y = (in_picture / s->columns + HALF) * s->cell_height;
 }
 
-ALWAYS void forward_cells(
-    const Scene *s, int64_t first, int64_t last, real *image, real *light, whole *stop, const int D, const int N
+/* Where a cell lies in the pictures: its first pixel, and how many rows and columns of it are inside. */
+typedef struct { int64_t first; int32_t across, down; } Window;
+
+ALWAYS Window window_of(const Run *s, int64_t cell) {
+    const int64_t each = (int64_t)s->columns * s->rows, in_picture = cell % each;
+    const int32_t x = (int32_t)(in_picture % s->columns) * s->cell_width;
+    const int32_t y = (int32_t)(in_picture / s->columns) * s->cell_height;
+    Window w = {.first = (cell / each * s->height + y) * s->width + x, .across = s->width - x, .down = s->height - y};
+    w.across = w.across < s->cell_width ? w.across : s->cell_width;
+    w.down = w.down < s->cell_height ? w.down : s->cell_height;
+    return w;
+}
+
+/* Channels of a cell's pixels from the pictures (zeros beyond the border), or back to them. */
+ALWAYS void read_cell(
+    const Run *s, Window w, const real *colors, const real *alphas, vec (*to)[MOST_VECTORS], const int D, const int N
 ) {
+    real pixels[MOST_CHANNELS][32];
+    if (w.across < s->cell_width || w.down < s->cell_height) memset(pixels, 0, sizeof pixels);
+    for (int y = 0; y < w.down; y++)
+        for (int x = 0; x < w.across; x++) {
+            const int64_t from = w.first + (int64_t)y * s->width + x;
+            for (int d = 0; d < D - 1; d++) pixels[d][y * s->cell_width + x] = colors[from * (D - 1) + d];
+            pixels[D - 1][y * s->cell_width + x] = alphas[from];
+        }
+    for (int d = 0; d < D; d++)
+        for (int i = 0; i < N; i++) to[d][i] = load(pixels[d] + i * LANES);
+}
+
+ALWAYS void write_cell(
+    const Run *s, Window w, const vec (*from)[MOST_VECTORS], real *colors, real *alphas, const int D, const int N
+) {
+    real pixels[MOST_CHANNELS][32];
+    for (int d = 0; d < D; d++)
+        for (int i = 0; i < N; i++) store(pixels[d] + i * LANES, from[d][i]);
+    for (int y = 0; y < w.down; y++)
+        for (int x = 0; x < w.across; x++) {
+            const int64_t to = w.first + (int64_t)y * s->width + x;
+            for (int d = 0; d < D - 1; d++) colors[to * (D - 1) + d] = pixels[d][y * s->cell_width + x];
+            alphas[to] = pixels[D - 1][y * s->cell_width + x];
+        }
+}
+
+ALWAYS void forward_cells(const Run *s, int64_t first, int64_t last, const int D, const int N) {
     const Pixels at = pixels_of(s);
     const int P = N * LANES;
     const real below = (real)s->below, cap = (real)s->cap;
     for (int64_t cell = first; cell < last; cell++) {
-        const int32_t *list = s->splats + s->starts[cell];
-        const int32_t count = s->starts[cell + 1] - s->starts[cell];
+        const int32_t *list = s->lists + s->list_starts[cell];
+        const int32_t count = s->list_counts[cell];
+        const Window window = window_of(s, cell);
         real x, y;
         centre_of(s, cell, &x, &y);
         vec sum[MOST_CHANNELS][MOST_VECTORS], T[MOST_VECTORS];
         ivec live[MOST_VECTORS], end[MOST_VECTORS];
-        for (int i = 0; i < N; i++) {
-            T[i] = load(light + cell * P + i * LANES); /* negative: stopped in an earlier run of Gaussians */
+        for (int d = 0; d < D; d++)
+            for (int i = 0; i < N; i++) sum[d][i] = splat(0);
+        if (s->light_before) read_cell(s, window, s->colors, s->alphas, sum, D, N);
+        for (int i = 0; i < N; i++) { /* negative: stopped in an earlier run of Gaussians */
+            T[i] = s->light_before ? load(s->light_before + cell * P + i * LANES) : splat(1);
             live[i] = T[i] > 0;
             T[i] = absolute(T[i]);
             end[i] = live[i] & count;
-            for (int d = 0; d < D; d++) sum[d][i] = load(image + (cell * D + d) * P + i * LANES);
         }
         ivec stopped = {0};
         for (int32_t r = 0; r < count; r++) {
@@ -166,10 +182,10 @@ ALWAYS void forward_cells(
             }
         }
         for (int i = 0; i < N; i++) {
-            store(light + cell * P + i * LANES, choose(live[i], T[i], -T[i]));
-            memcpy(stop + cell * P + i * LANES, &end[i], sizeof(ivec));
-            for (int d = 0; d < D; d++) store(image + (cell * D + d) * P + i * LANES, sum[d][i]);
+            store(s->light + cell * P + i * LANES, choose(live[i], T[i], -T[i]));
+            memcpy(s->stop + cell * P + i * LANES, &end[i], sizeof(ivec));
         }
+        write_cell(s, window, (const vec (*)[MOST_VECTORS])sum, s->colors, s->alphas, D, N);
     }
 }
 
@@ -240,40 +256,43 @@ FOLDED(folded_2, 2, column)
 #endif
 FOLDED(totals, 1, folded_2)
 
-/* Back to front. What each Gaussian of a cell gains goes to its row of the lists, or, where `rows` is NULL (one
- * thread), straight to the Gaussian's row of `sums_of` (`width` columns, a multiple of LANES): the same additions in the
- * same order as `fb_add_rows`.
+/* Back to front. What each Gaussian of a cell gains is added to its item's row of `sums` (`stride` columns, a multiple
+ * of LANES); `behind` passes on what is seen behind a run, and is NULL where there is one only.
  */
+typedef struct {
+    const real *colors, *alphas; /* what arrives, as the pictures */
+    real *behind, *sums;         /* [cells, pixels], [items, stride] */
+    int32_t absgrad;
+} Way;
+
 ALWAYS void backward_cells(
-    const Scene *s, int64_t first, int64_t last, const real *upstream, real *behind, real *light,
-    const whole *stop, const int absgrad, real *rows, real *sums_of, int32_t width, const int D, const int N
+    const Run *s, const Way *way, int64_t first, int64_t last, const int absgrad, const int D, const int N
 ) {
     const Pixels at = pixels_of(s);
     const int P = N * LANES;
+    const int32_t width = s->stride;
     const real below = (real)s->below, cap = (real)s->cap;
     for (int64_t cell = first; cell < last; cell++) {
-        const int32_t *list = s->splats + s->starts[cell];
-        const int32_t count = s->starts[cell + 1] - s->starts[cell];
+        const int32_t *list = s->lists + s->list_starts[cell];
         real x, y;
         centre_of(s, cell, &x, &y);
         vec U[MOST_CHANNELS][MOST_VECTORS], T[MOST_VECTORS], seen_behind[MOST_VECTORS];
         ivec end[MOST_VECTORS];
         whole deepest = 0;
         for (int i = 0; i < N; i++) {
-            T[i] = absolute(load(light + cell * P + i * LANES));
-            seen_behind[i] = load(behind + cell * P + i * LANES);
-            memcpy(&end[i], stop + cell * P + i * LANES, sizeof(ivec));
+            T[i] = absolute(load(s->light + cell * P + i * LANES));
+            seen_behind[i] = way->behind ? load(way->behind + cell * P + i * LANES) : splat(0);
+            memcpy(&end[i], s->stop + cell * P + i * LANES, sizeof(ivec));
             for (int l = 0; l < LANES; l++) deepest = end[i][l] > deepest ? end[i][l] : deepest;
-            for (int d = 0; d < D; d++) U[d][i] = load(upstream + (cell * D + d) * P + i * LANES);
         }
-        if (rows && deepest < count)
-            memset(rows + (int64_t)(s->starts[cell] + deepest) * width, 0, sizeof(real) * width * (count - deepest));
+        if (!deepest) continue;
+        read_cell(s, window_of(s, cell), way->colors, way->alphas, U, D, N);
         for (int32_t r = deepest - 1; r >= 0; r--) {
             const real *row = s->table + (int64_t)list[r] * s->stride;
-            real *to = rows ? rows + (int64_t)(s->starts[cell] + r) * width : sums_of + (int64_t)list[r] * width;
+            real *to = way->sums + (int64_t)list[r] * width;
             if (r >= AHEAD) {
                 __builtin_prefetch(s->table + (int64_t)list[r - AHEAD] * s->stride);
-                if (!rows) __builtin_prefetch(sums_of + (int64_t)list[r - AHEAD] * width, 1);
+                __builtin_prefetch(way->sums + (int64_t)list[r - AHEAD] * width, 1);
             }
             const Polynomial k = polynomial_of(row, x, y);
             const real A = row[3] * LOG_2, B = row[4] * LOG_2, C = row[5] * LOG_2;
@@ -294,67 +313,12 @@ ALWAYS void backward_cells(
             }
 #pragma GCC unroll 8
             for (int q = 0; q < PULLS + D - 1; q += LANES) {
-                vec told = totals(&p, q, absgrad, D, N);
-                store(to + q, rows ? told : load(to + q) + told);
+                store(to + q, load(to + q) + totals(&p, q, absgrad, D, N));
             }
         }
-        for (int i = 0; i < N; i++) {
-            store(light + cell * P + i * LANES, T[i]);
-            store(behind + cell * P + i * LANES, seen_behind[i]);
-        }
+        if (way->behind)
+            for (int i = 0; i < N; i++) store(way->behind + cell * P + i * LANES, seen_behind[i]);
     }
-}
-
-/* Which cells each Gaussian of a run touches, strip by strip: cell[i], the first one of strip i, and wide[i], how many.
- * Counts of the cells that are alive go to counts[cell + 1]. Returns the number of strips. The same ellipse as
- * `list_cells` in ../tiles/cells.py, whose columns these are.
- */
-typedef struct {
-    const real *x, *y, *skew, *over_A, *over_yy, *reach, *turn, *first_row;
-    const int32_t *rows, *camera; /* camera: NULL where there is one only */
-    const real *left, *right;    /* cells that the square box allows, or NULL */
-    int32_t columns, grid_rows, cell_width, cell_height;
-} Strips;
-
-ALWAYS real clamp(real x, real low, real high) { return x > low ? (x < high ? x : high) : low; } /* NaN: low */
-
-ALWAYS real edge(const Strips *s, int64_t g, real turning, real low, real high, real side) {
-    real y = clamp(turning, low, high);
-    real inside = s->reach[g] - y * y * s->over_yy[g];
-    return s->skew[g] * y + s->x[g] + side * (SQRT((inside < 0 ? 0 : inside) * s->over_A[g]) + (real)0.01);
-}
-
-int64_t fb_strips(
-    const Strips *s, int64_t begin, int64_t end, const uint8_t *alive, int32_t *cell, int32_t *wide, int32_t *counts
-) {
-    int64_t strips = 0;
-    const real width = s->cell_width, height = s->cell_height, columns = s->columns;
-    for (int64_t g = begin; g < end; g++) {
-        int32_t first = (int32_t)s->first_row[g], picture = s->camera ? s->camera[g] * s->grid_rows : 0;
-        real least = s->left ? s->left[g] : 0, most = s->right ? s->right[g] : columns;
-        for (int32_t row = first; row < first + s->rows[g]; row++, strips++) {
-            real low = row * height + HALF - s->y[g], high = low + (height - 1);
-            real from = FLOOR(CEIL(edge(s, g, -s->turn[g], low, high, -1) - HALF) / width);
-            real to = FLOOR(FLOOR(edge(s, g, s->turn[g], low, high, 1) - HALF) / width) + 1;
-            from = clamp(from, least > 0 ? least : 0, columns), to = clamp(to, 0, most < columns ? most : columns);
-            cell[strips] = (picture + row) * s->columns + (int32_t)from;
-            wide[strips] = to > from ? (int32_t)(to - from) : 0;
-            for (int32_t c = cell[strips]; c < cell[strips] + wide[strips]; c++) counts[c + 1] += alive ? alive[c] : 1;
-        }
-    }
-    return strips;
-}
-
-/* The lists: `next` holds where each cell's list begins, and is moved on to where it ends. */
-void fb_fill(
-    const Strips *s, int64_t begin, int64_t end, const uint8_t *alive, const int32_t *cell, const int32_t *wide,
-    int32_t *next, int32_t *splats
-) {
-    int64_t strip = 0;
-    for (int64_t g = begin; g < end; g++)
-        for (int32_t row = 0; row < s->rows[g]; row++, strip++)
-            for (int32_t c = cell[strip]; c < cell[strip] + wide[strip]; c++)
-                if (!alive || alive[c]) splats[next[c]++] = (int32_t)g;
 }
 
 /* One copy for each number of channels that is common, with loops unrolled. */
@@ -368,30 +332,34 @@ void fb_fill(
     default: CALL(s->channels); \
     }
 
-void fb_forward(const Scene *s, int64_t first, int64_t last, real *image, real *light, whole *stop) {
+/* Cells of a band: from the first, returned, to `last`. */
+ALWAYS int64_t cells_of(const Run *s, int64_t band, int64_t *last) {
+    const int64_t picture = band / s->bands, top = band % s->bands * s->band_rows;
+    const int64_t bottom = top + s->band_rows < s->rows ? top + s->band_rows : s->rows;
+    *last = (picture * s->rows + bottom) * s->columns;
+    return (picture * s->rows + top) * s->columns;
+}
+
+/* Lists and pictures of the bands from first to last. */
+void fb_forward(const Run *s, int64_t first_band, int64_t last_band) {
+    for (int64_t band = first_band; band < last_band; band++) {
+        int64_t last, first = cells_of(s, band, &last);
+        list_band(s, band);
 #define FORWARD(D) \
-    if (s->cell_width == 8) forward_cells(s, first, last, image, light, stop, D, 32 / LANES); \
-    else forward_cells(s, first, last, image, light, stop, D, 16 / LANES)
-    FOR_CHANNELS(FORWARD)
+    if (s->cell_width == 8) forward_cells(s, first, last, D, 32 / LANES); \
+    else forward_cells(s, first, last, D, 16 / LANES)
+        FOR_CHANNELS(FORWARD)
+    }
 }
 
-void fb_backward(
-    const Scene *s, int64_t first, int64_t last, const real *upstream, real *behind, real *light,
-    const whole *stop, int32_t absgrad, real *rows, real *sums_of, int32_t width
-) {
-#define RANGE s, first, last, upstream, behind, light, stop
+void fb_backward(const Run *s, int64_t first_band, int64_t last_band, const Way *way) {
+    for (int64_t band = first_band; band < last_band; band++) {
+        int64_t last, first = cells_of(s, band, &last), item = s->band_items[band];
+        memset(way->sums + item * s->stride, 0, sizeof(real) * s->stride * (s->band_items[band + 1] - item));
 #define BACKWARD(D) \
-    if (s->cell_width != 8) backward_cells(RANGE, absgrad, rows, sums_of, width, D, 16 / LANES); \
-    else if (absgrad) backward_cells(RANGE, 1, rows, sums_of, width, D, 32 / LANES); \
-    else backward_cells(RANGE, 0, rows, sums_of, width, D, 32 / LANES)
-    FOR_CHANNELS(BACKWARD)
-}
-
-/* sums[splats[i]] += rows[i], in the order of the rows. */
-void fb_add_rows(int64_t count, const int32_t *splats, const real *rows, int32_t width, real *sums) {
-    for (int64_t i = 0; i < count; i++) {
-        real *to = sums + (int64_t)splats[i] * width;
-        const real *from = rows + i * width;
-        for (int32_t c = 0; c < width; c++) to[c] += from[c];
+    if (s->cell_width != 8) backward_cells(s, way, first, last, way->absgrad, D, 16 / LANES); \
+    else if (way->absgrad) backward_cells(s, way, first, last, 1, D, 32 / LANES); \
+    else backward_cells(s, way, first, last, 0, D, 32 / LANES)
+        FOR_CHANNELS(BACKWARD)
     }
 }

@@ -1,8 +1,7 @@
-"""`composite` of ../tiles/compositing.py by the compiled library: same arguments, same pictures, same gradients.
+"""`composite` of ../tiles/compositing.py by the compiled library: same pictures, same gradients.
 
-Cells are independent of each other, so that ranges of them go to several threads (the library runs without Python's
-lock). What Gaussians gain from their cells is added up afterwards in one order: any number of threads gives the same
-bits.
+Bands of cells share nothing, so that they go to several threads (the library runs without Python's lock). What
+Gaussians gain in their bands is added up afterwards in one order: any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -17,51 +16,78 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from fb_core.splatting.compiled.library import loaded
-from fb_core.splatting.compiled.threads import in_parts, threads_for
-from fb_core.splatting.single_thread import single_thread
-from fb_core.splatting.tiles.blocks import Table, table_of
-from fb_core.splatting.tiles.cells import CellGrid, Ellipses, Strips, measure_strips, slabs
-from fb_core.splatting.tiles.compositing import PULLS, CompositingSettings, gradients_of, to_cells, to_image
+from fb_core.splatting.compiled.library import library_for, loaded
+from fb_core.splatting.compiled.threads import in_parts, in_ranges, threads_for
+from fb_core.splatting.projection import ALPHA_MIN
+from fb_core.splatting.tiles.blocks import GEOMETRY
+from fb_core.splatting.tiles.cells import CellGrid, slabs
+from fb_core.splatting.tiles.compositing import PULLS, CompositingSettings
 
 _LANES = 16  # the most that the library works on at once
 MOST_CHANNELS = 15
 """Values that the library composites at once; more go to torch."""
+_BANDS, _LEAST_BAND, _CELLS_OF_ONE_BAND = 12, 8, 1024
+"""Bands of a picture, rows of cells in one, and the cells up to which a picture has a single band: more bands balance
+threads, fewer split fewer Gaussians.
+"""
+_WHOLE = {torch.float32: torch.int32, torch.float64: torch.int64}
+_NUMBERS = ("width", "height", "columns", "rows", "cell_width", "cell_height", "band_rows", "bands")
+_TENSORS = (
+    "chosen", "radii", "means2d", "conics", "determinants", "opacities", "values", "first_row", "high", "first_column",
+    "wide", "logs", "band_items", "band_strips", "band_cells", "ranks", "starts", "places", "table", "strip_cells",
+    "strip_wide", "lists", "list_starts", "list_counts", "colors", "alphas", "light_before", "light", "stop",
+)  # fmt: skip
+_FOR_BACKWARD = (
+    "chosen", "conics", "opacities", "band_items", "band_cells", "starts", "places", "table", "lists", "list_starts",
+    "list_counts", "light", "stop",
+)  # fmt: skip
+"""What backward reads. The pictures are not among them: a result that its own graph holds is never freed."""
 
 
-class _Scene(ctypes.Structure):
-    """`Scene` of compositing.c."""
+class _Run(ctypes.Structure):
+    """`Run` of run.h."""
 
     _fields_ = [
-        ("table", ctypes.c_void_p),
-        *[(name, ctypes.c_int32) for name in ("stride", "channels")],
-        *[(name, ctypes.c_void_p) for name in ("splats", "starts")],
-        *[(name, ctypes.c_int32) for name in ("columns", "rows", "cell_width", "cell_height")],
+        *[(name, ctypes.c_int32) for name in (*_NUMBERS, "cameras", "tile_size", "channels", "stride")],
+        *[(name, ctypes.c_int64) for name in ("each", "begin", "end")],
         *[(name, ctypes.c_double) for name in ("below", "cap")],
+        *[(name, ctypes.c_void_p) for name in _TENSORS],
     ]
 
+    def hold(self, **tensors: Tensor | None) -> None:
+        """Point to the tensors, which live as long as this does."""
+        self.held = {**getattr(self, "held", {}), **tensors}
+        for name, tensor in tensors.items():
+            setattr(self, name, None if tensor is None else tensor.data_ptr())
 
-class _Strips(ctypes.Structure):
-    """`Strips` of compositing.c."""
+
+class _Way(ctypes.Structure):
+    """`Way` of compositing.c."""
 
     _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("x", "y", "skew", "over_A", "over_yy", "reach", "turn", "first_row")],
-        *[(name, ctypes.c_void_p) for name in ("rows", "camera", "left", "right")],
-        *[(name, ctypes.c_int32) for name in ("columns", "grid_rows", "cell_width", "cell_height")],
+        *[(name, ctypes.c_void_p) for name in ("colors", "alphas", "behind", "sums")],
+        ("absgrad", ctypes.c_int32),
     ]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lists:
-    """Gaussians by cell, near ones first: those of cell k are splats[starts[k] : starts[k + 1]]."""
+class Chosen:
+    """The V Gaussians that can be seen, and the pictures that they are seen in; constants for autograd."""
 
-    splats: Int32[Tensor, " m"]
-    starts: Int32[Tensor, " cells+1"]
+    ranks: Int32[Tensor, " v"]
+    """Their flat indices, camera * n + Gaussian, near ones first."""
+    determinants: Float[Tensor, "c n"]
+    """Of the screen covariances of all Gaussians, pixel^4."""
+    radii: Int32[Tensor, "c n"] | None
+    """Half sizes of the square boxes that cut, pixels; None where none do."""
+    tile_size: int
+    """Pixels of the tiles that the boxes are rounded up to."""
+    grid: CellGrid
 
 
-def can_composite(values: Float[Tensor, "v d"]) -> bool:
-    """Whether a library for such values has been made."""
-    return values.device.type == "cpu" and values.shape[1] <= MOST_CHANNELS and loaded(values.dtype) is not None
+def can_draw(channels: int, like: Tensor) -> bool:
+    """Whether a library for so many channels of such numbers has been made."""
+    return like.device.type == "cpu" and channels <= MOST_CHANNELS and loaded(like.dtype) is not None
 
 
 def composite_compiled(
@@ -69,140 +95,121 @@ def composite_compiled(
     conics: Float[Tensor, "c n 3"],
     opacities: Float[Tensor, "c n"],
     values: Float[Tensor, "v d"],
-    ellipses: Ellipses,
+    chosen: Chosen,
     settings: CompositingSettings,
 ) -> tuple[Float[Tensor, "c h w d"], Float[Tensor, "c h w 1"]]:
-    """As `tiles.compositing.composite`; the library must have been made (`can_composite`)."""
-    return _Compiled.apply(means2d, conics, opacities, values, ellipses, settings)
+    """As `tiles.compositing.composite`; the library must have been made (`can_draw`)."""
+    return _Compiled.apply(means2d, conics, opacities, values, chosen, settings)
 
 
-def _library(dtype: torch.dtype) -> ctypes.CDLL:
-    library = loaded(dtype)
-    if library is None:
-        raise ValueError(f"no compiled library for {dtype}: run `fillerbuster compile`, or draw with torch.")
-    return library
-
-
-def _lists(ellipses: Ellipses, strips: Strips, run: tuple[int, int], light: Float[Tensor, "cells p"]) -> Lists:
-    """The lists of one run of Gaussians, without the cells that the runs before have made opaque."""
-    library, grid = _library(light.dtype), ellipses.grid
-    bounds = (None, None) if ellipses.bounds is None else (ellipses.bounds[0], ellipses.bounds[1])
-    columns = [
-        ellipses.x, ellipses.y, strips.skew, strips.over_A, strips.over_yy, strips.reach, strips.turn,
-        strips.first_row, strips.rows, ellipses.camera, *bounds,
-    ]  # fmt: skip
-    held = [None if column is None else column.contiguous() for column in columns]
-    struct = _Strips(
-        *[None if column is None else column.data_ptr() for column in held],
-        grid.columns, grid.rows, grid.cell_width, grid.cell_height,
+def _start(gaussians: tuple[Tensor, Tensor, Tensor, Tensor], chosen: Chosen, settings: CompositingSettings) -> _Run:
+    """What all runs have in common; rows and columns of cells are measured."""
+    means2d, conics, opacities, values = (tensor.detach().contiguous() for tensor in gaussians)
+    grid, visible, channels = chosen.grid, values.shape[0], values.shape[1] + 1
+    few = grid.rows * grid.columns <= _CELLS_OF_ONE_BAND
+    band_rows = grid.rows if few else max(_LEAST_BAND, math.ceil(grid.rows / _BANDS))
+    below = torch.nextafter(values.new_tensor(ALPHA_MIN), values.new_zeros(()))
+    run = _Run(
+        width=grid.width, height=grid.height, columns=grid.columns, rows=grid.rows, cell_width=grid.cell_width,
+        cell_height=grid.cell_height, band_rows=band_rows, bands=math.ceil(grid.rows / band_rows),
+        cameras=grid.cameras, tile_size=0 if chosen.radii is None else chosen.tile_size, channels=channels,
+        stride=math.ceil((max(PULLS, GEOMETRY + 1) + channels - 1) / _LANES) * _LANES, each=means2d.shape[1],
+        below=float(below), cap=settings.alpha_cap,
     )  # fmt: skip
-    begin, end = run
-    alive = (light > 0).any(dim=1) if begin else None
-    number = int(strips.rows[begin:end].sum())
-    cell, wide = (torch.empty(number, dtype=torch.int32) for _ in range(2))
-    starts = torch.zeros(grid.count + 1, dtype=torch.int32)
-    where = ctypes.c_void_p(None if alive is None else alive.data_ptr())
-    library.fb_strips(
-        ctypes.byref(struct), ctypes.c_int64(begin), ctypes.c_int64(end), where, *map(_at, (cell, wide, starts))
-    )
-    starts = starts.cumsum(0, dtype=torch.int32)
-    splats = torch.empty(int(starts[-1]), dtype=torch.int32)
-    following = starts.clone()
-    library.fb_fill(
-        ctypes.byref(struct),
-        ctypes.c_int64(begin),
-        ctypes.c_int64(end),
-        where,
-        *map(_at, (cell, wide, following, splats)),
-    )
-    return Lists(splats=splats, starts=starts)
-
-
-def _at(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
-
-
-def _scene(table: Table, lists: Lists, grid: CellGrid) -> _Scene:
-    return _Scene(
-        table.rows.data_ptr(), table.rows.shape[1], table.channels, lists.splats.data_ptr(), lists.starts.data_ptr(),
-        grid.columns, grid.rows, grid.cell_width, grid.cell_height, table.alpha_threshold, table.cap,
+    spans = torch.empty(4, visible, dtype=torch.int32)
+    run.hold(
+        chosen=chosen.ranks, radii=chosen.radii, means2d=means2d, conics=conics, opacities=opacities, values=values,
+        determinants=chosen.determinants, first_row=spans[0], high=spans[1], first_column=spans[2],
+        wide=spans[3], logs=values.new_empty(visible),
+        colors=values.new_empty(grid.cameras, grid.height, grid.width, channels - 1),
+        alphas=values.new_empty(grid.cameras, grid.height, grid.width, 1),
     )  # fmt: skip
+    return run
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Run:
-    """A run of Gaussians that has been composited."""
+def _part(common: _Run, ranks: tuple[int, int], before: _Run | None, library: ctypes.CDLL) -> _Run:
+    """One run of Gaussians, with room for all that is made of it."""
+    run, grid_cells = _Run.from_buffer_copy(common), common.cameras * common.rows * common.columns
+    values, pixels = common.held["values"], common.cell_width * common.cell_height
 
-    lists: Lists
-    stop: Tensor
-    """For each pixel the rank in its cell's list from which on nothing was drawn."""
-    light: Float[Tensor, "cells p"]
-    """Transmittance behind the run; below 0 where a pixel has stopped."""
+    def room(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return torch.empty(shape, dtype=dtype)
+
+    run.begin, run.end = ranks
+    bands = torch.zeros(3, run.cameras * run.bands + 1, dtype=torch.int32)
+    starts = room(run.end - run.begin + 1)
+    run.hold(**common.held)
+    run.hold(band_items=bands[0], band_strips=bands[1], band_cells=bands[2], starts=starts)
+    library.fb_count_items(ctypes.byref(run))
+    items, strips, cells = bands[:, -1].tolist()
+    run.hold(
+        ranks=room(items), places=room(items), table=room(items, run.stride, dtype=values.dtype),
+        strip_cells=room(strips), strip_wide=room(strips), lists=room(cells), list_starts=room(grid_cells),
+        list_counts=room(grid_cells), light_before=None if before is None else before.held["light"],
+        light=room(grid_cells, pixels, dtype=values.dtype),
+        stop=room(grid_cells, pixels, dtype=_WHOLE[values.dtype]),
+    )  # fmt: skip
+    following = bands[0].clone()
+    library.fb_place_items(ctypes.byref(run), ctypes.c_void_p(following.data_ptr()))
+    return run
 
 
 class _Compiled(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means2d, conics, opacities, values, ellipses: Ellipses, settings: CompositingSettings):
-        library, runs, grid = _library(values.dtype), list[_Run](), ellipses.grid
-        needed = any(ctx.needs_input_grad[:4])
-        pixels = grid.cell_width * grid.cell_height
-        with single_thread():
-            table, strips = table_of(ellipses, values, settings.alpha_cap), measure_strips(ellipses)
-            image = values.new_zeros(grid.count, values.shape[1] + 1, pixels)
-            light = values.new_ones(grid.count, pixels)
-            for run in slabs(strips, settings.rows_per_list):
-                lists = _lists(ellipses, strips, run, light)
-                scene = _scene(table, lists, grid)
-                stop = torch.empty(light.shape, dtype=_WHOLE[values.dtype])
+    def forward(ctx: Any, means2d, conics, opacities, values, chosen: Chosen, settings: CompositingSettings):
+        library, runs = library_for(values.dtype), list[_Run]()
+        common, visible = _start((means2d, conics, opacities, values), chosen, settings), values.shape[0]
 
-                def forward(first: int, last: int, scene: _Scene = scene, stop: Tensor = stop) -> None:
-                    library.fb_forward(
-                        ctypes.byref(scene),
-                        ctypes.c_int64(first),
-                        ctypes.c_int64(last),
-                        *map(_at, (image, light, stop)),
-                    )
+        def measure(first: int, last: int) -> None:
+            library.fb_spans(ctypes.byref(common), ctypes.c_int64(first), ctypes.c_int64(last))
 
-                in_parts(forward, lists.starts, threads_for(lists.splats.shape[0]))
-                if needed:
-                    runs.append(_Run(lists=lists, stop=stop, light=light.clone()))
-            colors, alphas = to_image(image[:, :-1], grid), to_image(image[:, -1:], grid)
+        in_ranges(measure, visible, threads_for(visible))
+        for ranks in slabs(common.held["high"] * common.held["wide"], settings.rows_per_list) or [(0, 0)]:
+            run = _part(common, ranks, runs[-1] if runs else None, library)
+
+            def forward(first: int, last: int, run: _Run = run) -> None:
+                library.fb_forward(ctypes.byref(run), ctypes.c_int64(first), ctypes.c_int64(last))
+
+            in_parts(forward, run.held["band_cells"], threads_for(int(run.held["band_cells"][-1])))
+            runs.append(run)
+        images = common.held["colors"], common.held["alphas"]
+        for run in runs:
+            run.held = {name: run.held[name] for name in _FOR_BACKWARD}
         ctx.save_for_backward(means2d, conics, opacities, values)
-        ctx.ellipses, ctx.settings, ctx.table, ctx.runs = ellipses, settings, table, runs
-        return colors, alphas
+        ctx.settings, ctx.runs = settings, runs if any(ctx.needs_input_grad[:4]) else []
+        return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor, v_alphas: Tensor):  # type: ignore[override]
-        means2d, conics, opacities, values = ctx.saved_tensors
-        ellipses, grid, settings, table = ctx.ellipses, ctx.ellipses.grid, ctx.settings, ctx.table
-        library, channels = _library(values.dtype), values.shape[1]
-        with single_thread():
-            upstream = to_cells([v_colors, v_alphas], grid)
-            behind = upstream.new_zeros(grid.count, upstream.shape[2])
-            width = math.ceil((PULLS + channels) / _LANES) * _LANES
-            sums = values.new_zeros(values.shape[0], width)
-            for run in reversed(ctx.runs):
-                scene, light, lists = _scene(table, run.lists, grid), run.light.clone(), run.lists
-                threads = threads_for(lists.splats.shape[0])
-                rows = values.new_empty(lists.splats.shape[0], width) if threads > 1 else None
+        means2d, values, runs = ctx.saved_tensors[0], ctx.saved_tensors[3], ctx.runs
+        library, absgrad = library_for(values.dtype), ctx.settings.absgrad
+        gradients = [
+            torch.zeros(means2d.shape, dtype=values.dtype),
+            torch.zeros(means2d.shape, dtype=values.dtype) if absgrad else None,
+            torch.zeros(*means2d.shape[:2], 3, dtype=values.dtype),
+            torch.zeros(means2d.shape[:2], dtype=values.dtype),
+            torch.empty(values.shape, dtype=values.dtype),
+        ]
+        arriving = v_colors.contiguous(), v_alphas.contiguous()
+        behind = torch.zeros_like(runs[-1].held["light"]) if len(runs) > 1 else None
+        for run in reversed(runs):
+            sums = torch.empty_like(run.held["table"])
+            way = _Way(*[None if t is None else t.data_ptr() for t in (*arriving, behind, sums)], absgrad)
 
-                def backward(first: int, last: int, scene=scene, light=light, rows=rows, stop=run.stop) -> None:
-                    library.fb_backward(
-                        ctypes.byref(scene), ctypes.c_int64(first), ctypes.c_int64(last),
-                        *map(_at, (upstream, behind, light, stop)), ctypes.c_int32(settings.absgrad), _at(rows),
-                        _at(sums), ctypes.c_int32(width),
-                    )  # fmt: skip
+            def backward(first: int, last: int, run: _Run = run, way: _Way = way) -> None:
+                library.fb_backward(ctypes.byref(run), ctypes.c_int64(first), ctypes.c_int64(last), ctypes.byref(way))
 
-                in_parts(backward, lists.starts, threads)
-                if rows is not None:
-                    library.fb_add_rows(
-                        ctypes.c_int64(rows.shape[0]), _at(lists.splats), _at(rows), ctypes.c_int32(width), _at(sums)
-                    )
-            v_means2d, v_conics, v_opacities = gradients_of(
-                sums, means2d, conics, opacities, ellipses, settings.absgrad
-            )
-        return v_means2d, v_conics, v_opacities, sums[:, PULLS : PULLS + channels], None, None
+            def gather(first: int, last: int, run: _Run = run, sums: Tensor = sums) -> None:
+                addresses = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in (sums, *gradients)]
+                library.fb_gather(
+                    ctypes.byref(run), ctypes.c_int64(run.begin + first), ctypes.c_int64(run.begin + last), *addresses
+                )
 
-
-_WHOLE = {torch.float32: torch.int32, torch.float64: torch.int64}
+            in_parts(backward, run.held["band_cells"], threads_for(int(run.held["band_cells"][-1])))
+            in_ranges(gather, run.end - run.begin, threads_for(run.end - run.begin))
+        v_means2d, pulls, v_conics, v_opacities, v_values = gradients
+        if absgrad:
+            # Tensors declare no such attribute; gsplat's strategies read it.
+            setattr(means2d, "absgrad", pulls)  # noqa: B010
+        return v_means2d, v_conics, v_opacities, v_values, None, None

@@ -1,4 +1,4 @@
-"""The compiled lists and compositing of `compositing.c`: made once by `fillerbuster compile`, then found and loaded.
+"""The compiled drawing of splats (the C files here): made once by `fillerbuster compile`, then found and loaded.
 
 Nothing is compiled unasked. The library lies in the user's own cache folder, under a name that says from what it was
 made (source, options, processor), so that another version of this package or another processor never loads it.
@@ -21,11 +21,16 @@ import torch
 
 from fb_core.files.whole import whole_file
 
-SOURCE = Path(__file__).with_name("compositing.c")
+SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]")))
+"""What the library is made from: sources, and the headers that they share."""
 CACHE_VARIABLE = "FILLERBUSTER_CACHE"
 """Environment variable: folder of compiled libraries, instead of the system's usual place."""
 _OPTIONS = ("-O2", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 _DEFINES = {torch.float32: (), torch.float64: ("-DDOUBLE",)}
+_FUNCTIONS = (
+    "fb_project", "fb_project_backward", "fb_spans", "fb_count_items", "fb_place_items", "fb_forward", "fb_backward",
+    "fb_gather",
+)  # fmt: skip
 _COMPILERS = ("cc", "gcc", "clang")
 _logger = logging.getLogger(__name__)
 
@@ -36,7 +41,8 @@ class NoCompiler(ValueError):
 
 def library_path(dtype: torch.dtype) -> Path:
     """Where the library for tensors of this dtype lies, or would lie once it is made."""
-    made_from = (SOURCE.read_bytes(), " ".join((*_OPTIONS, *_DEFINES[dtype])).encode(), _processor().encode())
+    sources = [part for source in SOURCES for part in (source.name.encode(), source.read_bytes())]
+    made_from = (*sources, " ".join((*_OPTIONS, *_DEFINES[dtype])).encode(), _processor().encode())
     return cache_folder() / f"compositing-{hashlib.sha256(b'|'.join(made_from)).hexdigest()[:16]}.so"
 
 
@@ -70,7 +76,8 @@ def compile_libraries() -> list[Path]:
     made = []
     for dtype, defines in _DEFINES.items():
         with whole_file(library_path(dtype)) as unfinished:
-            command = [program, *_OPTIONS, *defines, str(SOURCE), "-o", str(unfinished), "-lm"]
+            sources = [str(source) for source in SOURCES if source.suffix == ".c"]
+            command = [program, *_OPTIONS, *defines, *sources, "-o", str(unfinished), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode != 0:
                 reason = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
@@ -96,12 +103,19 @@ def loaded(dtype: torch.dtype) -> ctypes.CDLL | None:
         return None
     try:
         library = ctypes.CDLL(str(path))
-        library.fb_strips.restype = ctypes.c_int64
-        for name in ("fb_fill", "fb_forward", "fb_backward", "fb_add_rows"):
+        for name in _FUNCTIONS:
             getattr(library, name).restype = None
     except (OSError, AttributeError):
         _logger.warning("%s cannot be loaded; torch draws. `fillerbuster compile` makes it anew.", path)
         return None
+    return library
+
+
+def library_for(dtype: torch.dtype) -> ctypes.CDLL:
+    """`loaded`, for who cannot do without. Raises ValueError where there is none."""
+    library = loaded(dtype)
+    if library is None:
+        raise ValueError(f"no compiled library for {dtype}: run `fillerbuster compile`, or draw with torch.")
     return library
 
 

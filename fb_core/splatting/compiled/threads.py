@@ -1,4 +1,4 @@
-"""Ranges of cells on as many threads as are worth it."""
+"""Ranges of bands and of Gaussians on as many threads as are worth it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-from fb_core.machine.parallel import free_cores
+from fb_core.machine.cores import free_cores
 
-_ROWS_PER_THREAD = 20_000  # (Gaussian, cell): below these another thread costs more than it saves
+_ROWS_PER_THREAD = 20_000  # (Gaussian, cell), or Gaussians: below these another thread costs more than it saves
 _PARTS_PER_THREAD = 4  # some take longer than others
 _fixed: ContextVar[int | None] = ContextVar("fixed_threads", default=None)
 
@@ -47,11 +47,11 @@ def fixed_threads(number: int) -> Iterator[None]:
 
 
 def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"], threads: int) -> None:
-    """``work(first, last)`` for ranges of cells that together are all of them.
+    """``work(first, last)`` for ranges of bands (or cells) that together are all of them.
 
     Args:
-        work: what is done with the cells from `first` to `last` (excluded); ranges must not disturb each other.
-        starts: where the list of each cell begins, and how many rows there are in all, by which ranges are cut.
+        work: what is done with those from `first` to `last` (excluded); ranges must not disturb each other.
+        starts: where the list of each begins, and how many rows there are in all, by which ranges are cut.
         threads: how many at once.
     """
     cells, rows = starts.shape[0] - 1, int(starts[-1])
@@ -63,6 +63,16 @@ def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"]
     edges = [0, *cuts, cells]
     ranges = [(first, last) for first, last in pairwise(edges) if last > first]
     list(_pool(os.getpid(), threads).map(lambda part: work(*part), ranges))
+
+
+def in_ranges(work: Callable[[int, int], None], number: int, threads: int) -> None:
+    """``work(first, last)`` for ranges that together are 0 to ``number``, about as many as threads; see `in_parts`."""
+    parts = min(threads, number)
+    if parts <= 1:
+        work(0, number)
+        return
+    edges = [number * part // parts for part in range(parts + 1)]
+    list(_pool(os.getpid(), threads).map(lambda part: work(*part), pairwise(edges)))
 
 
 @cache

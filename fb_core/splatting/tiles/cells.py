@@ -161,11 +161,11 @@ def measure_strips(ellipses: Ellipses) -> Strips:
     )
 
 
-def slabs(strips: Strips, budget: int) -> list[tuple[int, int]]:
+def slabs(cells: Int32[Tensor, " v"], budget: int) -> list[tuple[int, int]]:
     """Cut the depth order into runs of Gaussians whose lists hold at most `budget` rows (or one Gaussian), to bound the
-    memory.
+    memory; `cells` says of each how many it has at most.
     """
-    total = strips.cells.cumsum(0, dtype=torch.int64)
+    total = cells.cumsum(0, dtype=torch.int64)
     number = total.shape[0]
     if number == 0 or int(total[-1]) <= budget:
         return [(0, number)] if number else []

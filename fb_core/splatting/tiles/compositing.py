@@ -279,7 +279,7 @@ class _Composite(torch.autograd.Function):
                 values.new_ones(2, grid.count, pixels),
             )
             walked, starts = [], []
-            for run in slabs(strips, settings.rows_per_list):
+            for run in slabs(strips.cells, settings.rows_per_list):
                 starts.append((run, light.clone() if run[0] else None))
                 walked.clear()
                 keep = settings.kept_pairs

@@ -17,24 +17,28 @@ from method_configs.benchmarks.splats.scenes import SplatScene
 
 def compiled_rows(scene: SplatScene, runs: int) -> list[dict[str, Any]]:
     """One row for one thread (CPU seconds) and one for all cores (seconds by the clock), each beside torch's own one
-    thread in the same turns.
+    thread, and beside the library on one thread, in the same turns.
     """
     rows = []
     for threads in sorted({1, usable_cores()}):
         clock = time.process_time if threads == 1 else time.perf_counter
-        taken: dict[Draw, list[tuple[float, float]]] = {draw_torch: [], draw_compiled: []}
-        with fixed_threads(threads):
-            for _ in range(runs):
-                for draw, times in taken.items():
-                    times.append(seconds_of(draw, scene, clock))
-        (slow_forward, slow), (forward, both) = (
-            tuple(statistics.median(part) for part in zip(*times, strict=True)) for times in taken.values()
-        )
+        ways: dict[str, tuple[Draw, int]] = {"torch": (draw_torch, 1), "one": (draw_compiled, 1)}
+        if threads > 1:
+            ways["all"] = (draw_compiled, threads)
+        taken: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+        for _ in range(runs):
+            for name, (draw, used) in ways.items():
+                with fixed_threads(used):
+                    taken[name].append(seconds_of(draw, scene, clock))
+        medians = {
+            name: tuple(statistics.median(part) for part in zip(*times, strict=True)) for name, times in taken.items()
+        }
+        (slow_forward, slow), (_, one), (forward, both) = medians["torch"], medians["one"], [*medians.values()][-1]
         rows.append({
             "part": "compiled", "scene": scene.name, "threads": threads,
             "clock": "CPU" if threads == 1 else "wall", "forward_seconds": forward, "both_seconds": both,
             "torch_forward_seconds": slow_forward, "torch_both_seconds": slow,
-            "forward_ratio": slow_forward / forward, "both_ratio": slow / both,
+            "forward_ratio": slow_forward / forward, "both_ratio": slow / both, "over_one_thread": one / both,
         })  # fmt: skip
     return rows
 

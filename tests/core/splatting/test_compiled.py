@@ -122,7 +122,7 @@ def test_single_precision_is_as_near_to_the_truth_as_torch(compiled_library: Pat
 def test_runs_of_gaussians_do_not_change_the_result(compiled_library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lists are made run by run where they would not fit into memory; pixels that have stopped stay so."""
     whole = drawn(crowded(), "compiled")
-    monkeypatch.setattr(compositing, "slabs", lambda strips, budget: slabs(strips, 300))
+    monkeypatch.setattr(compositing, "slabs", lambda cells, budget: slabs(cells, 300))
     parts = drawn(crowded(), "compiled")
     for name, expected in whole.items():
         assert relative(parts[name], expected) < 1e-12, name
