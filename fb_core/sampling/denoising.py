@@ -11,6 +11,7 @@ from torch import Tensor
 
 from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
 from fb_core.machine.precision import resolved
+from fb_core.networks.shared_results import SharedResults
 from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.transformer.prepared import Prepared
 from fb_core.sampling.guidance import branches, guidance_map, guided
@@ -31,8 +32,8 @@ class Denoising:
     """The network."""
     conditioning: Conditioning
     """What is known."""
-    null: Conditioning
-    """That nothing is known."""
+    null: Conditioning | None
+    """That nothing is known; None where the guidance scale is 1 everywhere, which asks for no such branch."""
     noise: Float[Tensor, "n 32 h w"]
     """Noise of every view, on the network's device."""
     orders: Orders
@@ -51,6 +52,8 @@ class Denoising:
     """Branches of guidance in one batch; None is all."""
     prepared: Prepared | None = None
     """The network bound to what is known, which other draws of noise may share; None makes it when it is needed."""
+    shared: SharedResults | None = None
+    """What other samplings computed of the same known tokens, and may use of this one."""
 
     def __post_init__(self) -> None:
         if self.sampling.strength < 1 and self.current is None:
@@ -135,7 +138,13 @@ class Denoising:
         channels = torch.stack([part.channels for part in parts])
         facts = stacked_facts(parts, self.dit.config)
         return Prepared(
-            self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts
+            self.dit,
+            channels,
+            self.times[:-1],
+            text=text,
+            branches_at_once=self.branches_at_once,
+            facts=facts,
+            shared=self.shared,
         )
 
     @property
