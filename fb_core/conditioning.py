@@ -239,7 +239,7 @@ def encode_in_chunks(
     chunks = []
     for first in range(0, len(pixels), views_at_once):
         part = slice(first, first + views_at_once)
-        chunks.append(vae.encode(pixels[part], None if generators is None else generators[part]))
+        chunks.append(vae.encode(_laid_out(vae, pixels[part]), None if generators is None else generators[part]))
     return torch.cat(chunks)
 
 
@@ -265,7 +265,16 @@ def decode_in_chunks(
     (`TiledDecoder`).
     """
     decoder = None if tile is None else TiledDecoder(vae.decoder, tile)
-    return torch.cat([vae.decode(chunk, clamp=True, decoder=decoder) for chunk in latents.split(views_at_once)])
+    chunks = (_laid_out(vae, chunk) for chunk in latents.split(views_at_once))
+    return torch.cat([vae.decode(chunk, clamp=True, decoder=decoder).contiguous() for chunk in chunks])
+
+
+def _laid_out(vae: VAE, values: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """As convolutions take them fastest: with the channels last in memory on a CPU, a quarter less time for narrow
+    ones. Group norm computes other, less exact sums so; autoencoders with one keep the usual order.
+    """
+    faster = values.device.type == "cpu" and vae.config.norm == "none"
+    return values.contiguous(memory_format=torch.channels_last) if faster else values
 
 
 def join(state: Float[Tensor, "*b 32 h w"], conditioning: Conditioning) -> Float[Tensor, "*b 66 h w"]:

@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import torch
-import torch.nn.functional as F
 from einops import rearrange, repeat
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fb_core.networks.transformer.attention import Attention, KeysValues
+from fb_core.networks.transformer.attention import Attention, KeysValues, attended
 from fb_core.networks.transformer.ray_frames import RayFrames
 
 
@@ -128,7 +127,7 @@ class Relation:
         queries = attention.queries(x, text.values.dtype)
         count = len(text.keys)
         if count == 1:
-            return attention.answered(F.scaled_dot_product_attention(queries, *text), None)
+            return attention.answered(attended(queries, text), None)
         starts = torch.tensor([0, *(sequences for sequences, _ in self.stream.scenes)]).cumsum(0).tolist()
         step = (
             count // starts[-1] if self.known is None else 1
@@ -143,7 +142,7 @@ class Relation:
         self, queries: Float[Tensor, "1 heads row k"], looked_up: list[KeysValues]
     ) -> Float[Tensor, "1 heads row k"]:
         answers = [
-            F.scaled_dot_product_attention(asking, *pair) if asking.shape[2] else asking
+            attended(asking, pair) if asking.shape[2] else asking
             for asking, pair in zip(self.stream.cut(queries), looked_up, strict=True)
         ]
         return torch.cat([rearrange(answer, "s heads t k -> 1 heads (s t) k") for answer in answers], dim=2)
