@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from einops import reduce
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
@@ -136,7 +137,7 @@ class Denoising:
             text = torch.stack([text[0]] * len(parts) + [text[1]])
             parts = [*parts, self.conditioning]
         channels = torch.stack([part.channels for part in parts])
-        facts = stacked_facts(parts, self.dit.config)
+        facts = stacked_facts(parts, self.dit.config)._replace(asked=self._asked())
         return Prepared(
             self.dit,
             channels,
@@ -146,6 +147,15 @@ class Denoising:
             facts=facts,
             shared=self.shared,
         )
+
+    def _asked(self) -> Bool[Tensor, "n h w"] | None:
+        """Tokens whose velocity matters: where known latents are imposed, those that show an unknown one."""
+        sampling, patch = self.sampling, self.dit.config.patch
+        mixes = sampling.guidance.rescale > 0 or sampling.guidance.optimized_scale  # the latents of a view
+        if sampling.known != "imposed" or sampling.reference_compatible or mixes:
+            return None
+        unknown = known_channels(self.conditioning) <= 0
+        return reduce(unknown, "n z (h p) (w q) -> n h w", "any", p=patch, q=patch)
 
     @property
     def _prompted(self) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from fb_core.networks.transformer.attention import EPS, Attention, KeysValues, RMSNorm
@@ -123,18 +123,22 @@ class Block(nn.Module):
         text: KeysValues | None,
         frames: RayFrames | None = None,
         relation: Relation | None = None,
-    ) -> Float[Tensor, "b tokens d"]:
+        asked: Int[Tensor, "some"] | None = None,
+    ) -> Float[Tensor, "b some d"]:
         """The residual stream after this block, given its norms' modulation and the text's keys and values (None
         without text).
 
         `frames` are those of the tokens' rays. A `relation` says whom the tokens attend to instead of one another, and
-        in which frames.
+        in which frames. Without one, only tokens that are ``asked`` for may be computed: the others then just answer.
         """
         normed = self.norm1(x, scale_shifts[0])
         if relation is not None and relation.last is self.attn1:
             relation.keep(self.attn1, normed)
             return x
-        x = x + (self.attn1(normed, None, frames) if relation is None else relation.gathered(self.attn1, normed))
+        if relation is None:
+            x = (x if asked is None else x[:, asked]) + self.attn1(normed, None, frames, asked)
+        else:
+            x = x + relation.gathered(self.attn1, normed)
         if text is not None:
             normed = self.norm2(x, scale_shifts[1])
             x = x + (self.attn2(normed, text) if relation is None else relation.read(self.attn2, normed, text))

@@ -54,6 +54,8 @@ class _Bound:
     """What attention is told in."""
     apart: _Apart | None
     """None where no known token stands apart."""
+    asked: Int[Tensor, "some"] | None
+    """Places of the tokens whose velocity matters; None is all."""
 
 
 class Prepared:
@@ -102,6 +104,8 @@ class Prepared:
         self.branches_at_once = branches_at_once or branches
         self._size = height, width
         self._facts = facts
+        joint = dit.config.known_tokens == "joint"
+        self._asked = facts.asked if joint and facts.asked is not None and not bool(facts.asked.all()) else None
         self._shared = shared
         self._told = conditioning[:, :, :noisy] if dit.known_of(facts) is not None else None
         self._bound: dict[tuple[int, int], _Bound] = {}
@@ -147,7 +151,7 @@ class Prepared:
         """The velocity of some branches, given what their tokens share."""
         tokens, apart = shared + bound.tokens, bound.apart
         if apart is None:
-            patches = self.dit.run_blocks(tokens, modulation, bound.contexts, bound.frames)
+            patches = self.dit.run_blocks(tokens, modulation, bound.contexts, bound.frames, bound.asked)
             return self.dit.unpatchify(patches, len(state), *self._size)
         patches = self.dit.run_unknown(tokens, apart.others, apart.looked_up, modulation, bound.contexts, bound.frames)
         velocity = self.dit.unpatchify(patches, len(state), *self._size)
@@ -180,7 +184,10 @@ class Prepared:
                 others=others,
                 looked_up=self._looked_up(clean, stream, contexts, frames),
             )
-        bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart)
+        asked = self._asked
+        if asked is not None:
+            asked = (asked if views is None else asked[views]).flatten().nonzero()[:, 0]
+        bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart, asked=asked)
         if views is None:
             self._bound[part.start, part.stop] = bound
         return bound

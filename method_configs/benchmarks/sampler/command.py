@@ -55,12 +55,12 @@ class Sampler:
         from method_configs.benchmarks.command import show
         from method_configs.benchmarks.sampler import solvers_and_grids as benchmark
 
+        if not self.guidance:
+            return self._run_tasks()
         config = dataclasses.replace(benchmark.QUICK, seed=self.seed)
         if not self.quick:
             names = ("guidance", "fine_steps", "problems", "views", "size", "seed")
             config = benchmark.SamplerBenchmark(**{name: getattr(self, name) for name in names})
-        if not self.guidance:
-            return self._run_tasks()
         config = dataclasses.replace(config, model=not self.flow_only)
         model = None if self.flow_only else Fillerbuster.from_pretrained(self.model)
         report = benchmark.run_sampler(config, model, on_cell=lambda cell: _logger.info("measuring %s", cell))
