@@ -14,8 +14,8 @@ from fb_core.networks.transformer.embeddings import at_least_float32
 from fb_core.networks.transformer.ray_frames import RayFrames, transformed
 
 EPS = 1e-5
-_MOST_WEIGHTS = 2**23
-"""Of attention that are held at once: 32 MiB with their scores."""
+_MOST_WEIGHTS, _FEWEST_QUERIES = 2**21, 64
+"""Weights of attention that are held at once (8 MiB with their scores), and queries that are worth a product."""
 
 
 class RMSNorm(nn.Module):
@@ -42,17 +42,21 @@ def attended(queries: Float[Tensor, "b heads tokens k"], looked_up: KeysValues) 
     """Values weighted by the softmax of queries times keys over the root of their channels.
 
     On a CPU torch's fused kernel computes products of bfloat16 at the speed of float32; two plain products are almost
-    twice as fast. They hold all weights at once, in bfloat16, so only small ones are computed so, and none for a
-    gradient.
+    twice as fast. They hold scores and weights in bfloat16, which rounds them, a bounded number at a time. Not for
+    gradients, nor where too few queries at a time would be left.
     """
-    rows = queries.shape[:-2].numel()
-    small = 0 < rows * queries.shape[-2] * looked_up.keys.shape[-2] <= _MOST_WEIGHTS
-    if queries.device.type != "cpu" or queries.dtype != torch.bfloat16 or torch.is_grad_enabled() or not small:
+    rows, asking, looked = queries.shape[:-2].numel(), queries.shape[-2], looked_up.keys.shape[-2]
+    at_once = _MOST_WEIGHTS // max(1, rows * looked)
+    plain = queries.device.type == "cpu" and queries.dtype == torch.bfloat16 and not torch.is_grad_enabled()
+    if not plain or not rows * asking * looked or at_once < min(asking, _FEWEST_QUERIES):
         return F.scaled_dot_product_attention(queries, *looked_up)
-    asking, keys, values = (x.reshape(rows, *x.shape[-2:]) for x in (queries, *looked_up))
-    scale = queries.shape[-1] ** -0.5
-    scores = torch.baddbmm(queries.new_empty(()), asking, keys.mT, beta=0, alpha=scale)
-    return torch.bmm(scores.softmax(dim=-1), values).view(queries.shape)
+    flat, keys, values = (x.reshape(rows, *x.shape[-2:]) for x in (queries, *looked_up))
+    scale, nothing = queries.shape[-1] ** -0.5, queries.new_empty(())
+    answers = [
+        torch.bmm(torch.baddbmm(nothing, part, keys.mT, beta=0, alpha=scale).softmax(dim=-1), values)
+        for part in flat.split(at_once, dim=1)
+    ]
+    return torch.cat(answers, dim=1).view(queries.shape)
 
 
 class Attention(nn.Module):
