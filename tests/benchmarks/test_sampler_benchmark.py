@@ -98,7 +98,7 @@ def test_without_guidance_it_measures_the_steps_of_every_task(tmp_path):
 
 def test_as_many_steps_as_the_exact_ones_have_no_error():
     model = Fillerbuster.from_pretrained()
-    report = run_tasks(model, rooms=1, views=2, size=32, seed=0, steps=(3,), exact_steps=3)
+    report = run_tasks(model, rooms=1, views=2, size=32, seed=0, steps=(3, 3))
     assert all(row["latent_error"] == 0 and row.get("degrees_to_exact", 0.0) < 0.05 for row in report.rows)
 
 

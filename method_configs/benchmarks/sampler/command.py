@@ -70,16 +70,15 @@ class Sampler:
     def _run_tasks(self) -> None:
         from fb_core.inpainter import Fillerbuster
         from method_configs.benchmarks.command import show
-        from method_configs.benchmarks.sampler.steps_by_task import draw_tasks, run_tasks
+        from method_configs.benchmarks.sampler.steps_by_task import STEPS, draw_tasks, run_tasks
 
         if self.flow_only:
             raise ValueError("guidance: without any there is only the model to measure; leave --flow-only out")
-        quick = {"steps": (1, 2), "exact_steps": 3} if self.quick else {}
         report = run_tasks(
             Fillerbuster.from_pretrained(self.model),
             rooms=self.problems, views=self.views, size=self.size, seed=self.seed,
             on_cell=lambda cell: _logger.info("measuring %s", cell),
-            **quick,
+            steps=(1, 2, 3) if self.quick else STEPS,
         )  # fmt: skip
         figure = self.figure
         show(report, self.json, [] if figure is None else [lambda: draw_tasks(report, figure)])
