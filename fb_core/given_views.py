@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
 
 from fb_core.conditioning import only_known
-from fb_core.memory.budget import SIDE_MULTIPLE
+from fb_core.geometry.raymap import CanonicalFrame
+from fb_core.memory.budget import SIDE_MULTIPLE, Cut
+from fb_core.networks.shared_results import SharedResults
+from fb_core.sampling.options import SamplingConfig
 from fb_core.views import Views
 
 # Known values beyond are no colours or places, and their squares would overflow.
 _FARTHEST = {"pixels": 1e4, "rays": 1e12}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """Views to be completed, as the networks take them."""
+
+    views: Views
+    """Padded, in float32 (raymaps perhaps more exact), on the model's device."""
+    frame: CanonicalFrame | None
+    """Of the known rays, None where none are."""
+    cut: Cut
+    """How the work is cut to fit the memory."""
+    sampling: SamplingConfig
+    """As it was asked for."""
+    shared: SharedResults | None
+    """What other calls may have computed already."""
+
+    def canonical(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
+        """Raymaps of the world in the canonical frame."""
+        return raymaps if self.frame is None else self.frame.apply(raymaps)
 
 
 def check_views(views: Views) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -27,10 +26,11 @@ from fb_core.conditioning import (
     unsplit,
 )
 from fb_core.geometry.known_rays import frame_of_known_rays
-from fb_core.geometry.raymap import CanonicalFrame, from_unit_range, to_unit_range
-from fb_core.given_views import as_given, check_current, check_views, padded, working
+from fb_core.geometry.raymap import from_unit_range, to_unit_range
+from fb_core.given_views import Job, as_given, check_current, check_views, padded, working
 from fb_core.machine.precision import in_own_precision, resolved
 from fb_core.memory.budget import Cut, MemoryEstimate, available_bytes, estimate, uncut
+from fb_core.networks.shared_results import SharedResults
 from fb_core.networks.text import TextEncoder
 from fb_core.sampling.denoising import Denoising
 from fb_core.sampling.integration.trajectory import OnStep, SamplingInterrupted, counted
@@ -42,24 +42,6 @@ from fb_core.views import Views
 
 BUNDLED_MODEL = Path(__file__).parent / "pretrained" / "rooms-tiny"
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """Views to be completed, as the networks take them."""
-
-    views: Views
-    """Padded, in float32 (raymaps perhaps more exact), on the model's device."""
-    frame: CanonicalFrame | None
-    """Of the known rays, None where none are."""
-    cut: Cut
-    """How the work is cut to fit the memory."""
-    sampling: SamplingConfig
-    """As it was asked for."""
-
-    def canonical(self, raymaps: Float[Tensor, "n 6 h w"]) -> Float[Tensor, "n 6 h w"]:
-        """Raymaps of the world in the canonical frame."""
-        return raymaps if self.frame is None else self.frame.apply(raymaps)
 
 
 class Fillerbuster:
@@ -79,6 +61,8 @@ class Fillerbuster:
             self.text = text_encoder.encode([""])[0].to(self.device)
         self.model_hash = model_hash
         """Content hash of the weights; part of what identifies a generated view."""
+        self.shared: SharedResults | None = None
+        """What further calls may use again of one that was told the same, to the same bits; None keeps nothing."""
         for module in (self.dit, self.image_vae, self.raymap_vae):
             module.requires_grad_(False).eval()
 
@@ -135,7 +119,8 @@ class Fillerbuster:
         """
         sampling = self.recommended_sampling if sampling is None else sampling
         prompted = bool(prompt) and sampling.guidance_text != 0
-        return estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
+        needed = estimate(views, size, self.dit.dtype, model=self.config, sampling=sampling, prompted=prompted)
+        return needed.beside(0 if self.shared is None else self.shared.limit_bytes, sampling.memory_budget_bytes)
 
     @torch.no_grad()
     @in_own_precision
@@ -237,7 +222,7 @@ class Fillerbuster:
 
     def _asked(
         self, views: Views, sampling: SamplingConfig | None, prompt: str | None, current: Views | None
-    ) -> tuple[_Job, Start, Float[Tensor, "texts words t"] | None]:
+    ) -> tuple[Job, Start, Float[Tensor, "texts words t"] | None]:
         """What `complete` is asked, looked at and made ready."""
         check_views(views)
         if current is not None:
@@ -273,6 +258,7 @@ class Fillerbuster:
         free = None
         if sampling.memory_budget_bytes is None:
             free = available_bytes(self.device)
+            free = None if free is None else max(0, free - (self.shared.room_bytes if self.shared else 0))
             cut = uncut(views, size, free, model=self.config, sampling=sampling, prompted=bool(prompt))
             if cut is not None:
                 return cut
@@ -291,14 +277,18 @@ class Fillerbuster:
         job = self._job(views, sampling, None)
         return self._denoising(job, Start(sampling=sampling), self._text_of(None), seed)
 
-    def _job(self, views: Views, sampling: SamplingConfig, prompt: str | None) -> _Job:
+    def _job(self, views: Views, sampling: SamplingConfig, prompt: str | None) -> Job:
         """The views as the networks take them, their frame, and how the work is cut."""
-        cut = self._cut(len(views), views.size, sampling, prompt)
+        cut, shared = self._cut(len(views), views.size, sampling, prompt), self.shared
+        if shared is not None and sampling.memory_budget_bytes is not None:
+            if not self.estimate(len(views), views.size, sampling, prompt=prompt).shared:
+                shared.forget()
+                shared = None
         ready = working(views, self.device)
         frame = frame_of_known_rays(ready.raymaps, ready.rays_known)
-        return _Job(views=padded(ready), frame=frame, cut=cut, sampling=sampling)
+        return Job(views=padded(ready), frame=frame, cut=cut, sampling=sampling, shared=shared)
 
-    def _start(self, job: _Job, current: Views | None) -> Start:
+    def _start(self, job: Job, current: Views | None) -> Start:
         """What denoising starts from and is told as a guess, of views that there are already."""
         sampling = job.sampling
         if current is None:
@@ -315,7 +305,7 @@ class Fillerbuster:
             sampling = dataclasses.replace(sampling, strength=1.0)  # they tell nothing that is not known anyway
         return Start(sampling=sampling, guess=guess)
 
-    def _denoising(self, job: _Job, start: Start, text: Tensor | None, seed: int) -> Denoising:
+    def _denoising(self, job: Job, start: Start, text: Tensor | None, seed: int) -> Denoising:
         """What is known of the views, encoded, with all draws."""
         views, guess, sampling = job.views, start.guess, start.sampling
         vaes = {"image_vae": self.image_vae, "raymap_vae": self.raymap_vae}
@@ -329,6 +319,7 @@ class Fillerbuster:
                 views_at_once=job.cut.views_encoded,
                 generators=posterior_generators(seed, len(views)) if sampling.sample_posterior else None,
                 precision=resolved(sampling.precision, self.device),
+                shared=job.shared,
             ),
             transformer=self.dit.config,
             guess=None if guess is None else (guess.images, sampling.belief * guess.image_known),
@@ -337,7 +328,7 @@ class Fillerbuster:
         return Denoising(
             dit=self.dit,
             conditioning=conditioning,
-            null=encode_null(conditioning, **vaes, pixels=views.size),
+            null=encode_null(conditioning, **vaes, pixels=views.size) if sampling.guides else None,
             noise=noise_of(seed, len(views), (height, width)).to(self.device),
             orders=random_orders(seed),
             sampling=sampling,
@@ -345,9 +336,10 @@ class Fillerbuster:
             current=start.latents,
             counts=start.joined,
             branches_at_once=job.cut.branches,
+            shared=job.shared,
         )
 
-    def _encoded(self, current: Views, job: _Job) -> Float[Tensor, "n 32 h w"]:
+    def _encoded(self, current: Views, job: Job) -> Float[Tensor, "n 32 h w"]:
         """Latents of current views, where known pixels and rays take the place of the current ones."""
         views, at_once = job.views, job.cut.views_encoded
         # A mask below 1 says when a pixel joins, not how dark it is.
@@ -364,7 +356,7 @@ class Fillerbuster:
             encode_in_chunks(self.image_vae, images, at_once), encode_in_chunks(self.raymap_vae, raymaps01, at_once)
         )
 
-    def _decode(self, job: _Job, latents: Tensor) -> Views:
+    def _decode(self, job: Job, latents: Tensor) -> Views:
         """Pixels and rays of the latents, with what is known pasted back; views that are wholly known are not
         decoded.
         """

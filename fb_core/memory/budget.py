@@ -79,6 +79,13 @@ class MemoryEstimate:
     """Decoding and pasting, beside the weights."""
     cut: Cut
     """How the work is cut."""
+    shared: int = 0
+    """Kept for further calls (`fb_core.networks.shared_results`)."""
+
+    def beside(self, shared: int, budget: int | None) -> MemoryEstimate:
+        """The same with so much kept for further calls, where the budget has room for it; else nothing is kept."""
+        fits = budget is None or self.peak + shared <= budget
+        return dataclasses.replace(self, shared=shared if fits else 0)
 
     @property
     def working(self) -> int:
@@ -88,7 +95,7 @@ class MemoryEstimate:
     @property
     def peak(self) -> int:
         """Bytes needed in all."""
-        return self.weights + self.working
+        return self.weights + self.working + self.shared
 
 
 def estimate(
@@ -231,8 +238,7 @@ def _most_views(bytes_of: Callable[[int], int], views: int, asked: int | None, r
 
 
 def _branch_count(sampling: SamplingConfig, prompted: bool) -> int:
-    guides = not sampling.guidance_known == sampling.guidance_unknown == 1
-    return 1 + guides + (prompted and sampling.guidance_text != 0)
+    return 1 + sampling.guides + (prompted and sampling.guidance_text != 0)
 
 
 # The phases, on the meta device ------------------------------------------------------------------------------------

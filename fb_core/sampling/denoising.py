@@ -6,11 +6,13 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from einops import reduce
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.conditioning import STATE_CHANNELS, Conditioning, stacked_facts
 from fb_core.machine.precision import resolved
+from fb_core.networks.shared_results import SharedResults
 from fb_core.networks.transformer.dit import DiT
 from fb_core.networks.transformer.prepared import Prepared
 from fb_core.sampling.guidance import branches, guidance_map, guided
@@ -31,8 +33,8 @@ class Denoising:
     """The network."""
     conditioning: Conditioning
     """What is known."""
-    null: Conditioning
-    """That nothing is known."""
+    null: Conditioning | None
+    """That nothing is known; None where the guidance scale is 1 everywhere, which asks for no such branch."""
     noise: Float[Tensor, "n 32 h w"]
     """Noise of every view, on the network's device."""
     orders: Orders
@@ -51,6 +53,8 @@ class Denoising:
     """Branches of guidance in one batch; None is all."""
     prepared: Prepared | None = None
     """The network bound to what is known, which other draws of noise may share; None makes it when it is needed."""
+    shared: SharedResults | None = None
+    """What other samplings computed of the same known tokens, and may use of this one."""
 
     def __post_init__(self) -> None:
         if self.sampling.strength < 1 and self.current is None:
@@ -133,10 +137,25 @@ class Denoising:
             text = torch.stack([text[0]] * len(parts) + [text[1]])
             parts = [*parts, self.conditioning]
         channels = torch.stack([part.channels for part in parts])
-        facts = stacked_facts(parts, self.dit.config)
+        facts = stacked_facts(parts, self.dit.config)._replace(asked=self._asked())
         return Prepared(
-            self.dit, channels, self.times[:-1], text=text, branches_at_once=self.branches_at_once, facts=facts
+            self.dit,
+            channels,
+            self.times[:-1],
+            text=text,
+            branches_at_once=self.branches_at_once,
+            facts=facts,
+            shared=self.shared,
         )
+
+    def _asked(self) -> Bool[Tensor, "n h w"] | None:
+        """Tokens whose velocity matters: where known latents are imposed, those that show an unknown one."""
+        sampling, patch = self.sampling, self.dit.config.patch
+        mixes = sampling.guidance.rescale > 0 or sampling.guidance.optimized_scale  # the latents of a view
+        if sampling.known != "imposed" or sampling.reference_compatible or mixes:
+            return None
+        unknown = known_channels(self.conditioning) <= 0
+        return reduce(unknown, "n z (h p) (w q) -> n h w", "any", p=patch, q=patch)
 
     @property
     def _prompted(self) -> bool:

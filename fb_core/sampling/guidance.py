@@ -89,11 +89,19 @@ def guidance_map(conditioning: Conditioning, *, known: float, unknown: float) ->
     return unsplit(image.expand(-1, LATENT_CHANNELS, -1, -1), rays.expand(-1, LATENT_CHANNELS, -1, -1))
 
 
-def branches(conditioning: Conditioning, null: Conditioning, scale: Float[Tensor, "n 32 h w"]) -> list[Conditioning]:
+def branches(
+    conditioning: Conditioning, null: Conditioning | None, scale: Float[Tensor, "n 32 h w"]
+) -> list[Conditioning]:
     """What guidance has to evaluate: (null, conditional), or only the conditional branch when the scale is 1
     everywhere.
+
+    Raises ValueError where a null branch is needed and there is none.
     """
-    return [conditioning] if bool((scale == 1).all()) else [null, conditioning]
+    if bool((scale == 1).all()):
+        return [conditioning]
+    if null is None:
+        raise ValueError("guidance: a scale other than 1 needs the conditioning of 'nothing is known', got None")
+    return [null, conditioning]
 
 
 def evaluated_by(network: Callable[[Tensor, Tensor], Tensor], parts: list[Conditioning]) -> Predict:

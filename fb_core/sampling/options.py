@@ -108,6 +108,11 @@ class SamplingConfig:
             require_between(name, getattr(self, name), -_MOST_GUIDANCE, _MOST_GUIDANCE)
 
     @property
+    def guides(self) -> bool:
+        """Whether a branch of which nothing is known is asked for anywhere."""
+        return not self.guidance_known == self.guidance_unknown == 1
+
+    @property
     def times(self) -> list[float]:
         """The times of a sampling, from where it starts to 0, through those at which guidance makes the velocity
         jump.

@@ -50,24 +50,65 @@ def _say(answer: dict[str, Any]) -> None:
 
 
 def _completed(model: Any, sampling: Any, asked: dict[str, Any]) -> dict[str, float]:
-    """Complete the views of a file, keep the answer in another one."""
+    """Complete the views of a file round by round as a completion does, keep the answers in another one."""
+    import numpy as np
+    import torch
+
+    rounds = _rounds(asked)
+    if len(rounds) > 1 and hasattr(model, "shared"):
+        model.shared = importlib.import_module("fb_core.networks.shared_results").SharedResults()
+    began, began_cpu = time.perf_counter(), time.process_time()
+    answers = [
+        model.complete(views, generator=torch.Generator().manual_seed(asked["seed"] + number), sampling=sampling)
+        for number, views in enumerate(rounds)
+    ]
+    took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - began_cpu}
+    generated = torch.cat([answer.images[asked["known"] :] for answer in answers])
+    np.save(asked["answer"], generated.clamp(0, 1).numpy())
+    if asked["exact_steps"]:
+        took["latent_error"] = _latent_error(model, sampling, rounds[0], asked)
+    return took
+
+
+def _rounds(asked: dict[str, Any]) -> list[Any]:
+    """The known views of a file and, in each round, so many others of which the rays are known."""
     import numpy as np
     import torch
 
     from fb_core.views import Views
 
+    first, unknown = asked["known"], asked["unknown"]
     with np.load(asked["views"]) as stored:
         images, raymaps = (torch.from_numpy(stored[name]) for name in ("images", "raymaps"))
-    known = torch.ones_like(images[:, :1])
-    image_known = known.clone()
-    image_known[asked["known"] :] = 0
-    views = Views(images=images * image_known, image_known=image_known, raymaps=raymaps, rays_known=known)
-    generator = torch.Generator().manual_seed(asked["seed"])
-    began, began_cpu = time.perf_counter(), time.process_time()
-    answer = model.complete(views, generator=generator, sampling=sampling)
-    took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - began_cpu}
-    np.save(asked["answer"], answer.images[asked["known"] :].clamp(0, 1).numpy())
-    return took
+    rounds = []
+    for start in range(first, len(images), unknown):
+        chosen = [*range(first), *range(start, start + unknown)]
+        known = torch.ones_like(images[chosen, :1])
+        image_known = known.clone()
+        image_known[first:] = 0
+        rounds.append(
+            Views(
+                images=images[chosen] * image_known,
+                image_known=image_known,
+                raymaps=raymaps[chosen],
+                rays_known=known,
+            )
+        )
+    return rounds
+
+
+def _latent_error(model: Any, sampling: Any, views: Any, asked: dict[str, Any]) -> float:
+    """Distance of the generated views' latents from those of many steps, over the length of these."""
+    import torch
+
+    with torch.no_grad():
+        got, exact = (
+            model.denoising(views, seed=asked["seed"], sampling=dataclasses.replace(sampling, steps=steps)).run()
+            for steps in (sampling.steps, asked["exact_steps"])
+        )
+    # The first 16 channels are the image's; rays are known.
+    got, exact = got[asked["known"] :, :16], exact[asked["known"] :, :16]
+    return float((got - exact).norm() / exact.norm())
 
 
 class _Training:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 _HERE = Path(__file__).resolve().parent
 _ROOT = _HERE.parents[1]
+_EXACT_STEPS = 64
+"""Steps whose latents stand for exact ones."""
+_ROOMS_WITH_ERROR = 2
+"""Rooms in which latents are compared with them, which takes as long as eight samplings; none in rounds."""
 _logger = logging.getLogger(__name__)
 
 
@@ -38,7 +43,7 @@ class Builds(TableFiles):
     other: Path
     """Root of the other checkout (git worktree add ../other COMMIT)."""
     cases: tuple[str, ...] = ("16+24", "36+4")
-    """Known + unknown views."""
+    """Known + unknown views; 16+24x4 are four rounds of 24 views each that share 16 known ones."""
     rooms: int = 10
     """Unseen rooms."""
     training_steps: int = 0
@@ -63,28 +68,31 @@ class Builds(TableFiles):
             raise ValueError(
                 f"bench builds: expected at least one room and one thread, got {self.rooms} and {self.threads}"
             )
-        cases = [_case_of(text) for text in self.cases]
+        cases = [_Case.of(text) for text in self.cases]
         report = Report(seed=self.seed)
         with (
             tempfile.TemporaryDirectory(prefix="fillerbuster-builds-") as folder,
             _Build("this", _ROOT, self.threads) as this,
             _Build("other", self.other.resolve(), self.threads) as other,
         ):
-            for known, unknown in cases:
-                report.rows.extend(self._rows(Path(folder), (this, other), known, unknown))
+            for case in cases:
+                report.rows.extend(self._rows(Path(folder), (this, other), case))
             if self.training_steps:
                 report.rows.extend(self._training_rows(this, other))
         self.publish(report, draw)
 
-    def _rows(self, folder: Path, builds: tuple[_Build, ...], known: int, unknown: int) -> list[dict[str, Any]]:
+    def _rows(self, folder: Path, builds: tuple[_Build, ...], case: _Case) -> list[dict[str, Any]]:
         """The builds' figures for one case, this one's with its gain over the other one."""
-        _logger.info("%d known and %d unknown views in %d rooms", known, unknown, self.rooms)
+        _logger.info("%s views in %d rooms", case.text, self.rooms)
         results: dict[str, list[dict[str, float]]] = {build.name: [] for build in builds}
         for number in range(self.rooms):
-            stored, truth = _stored_views(folder, known, unknown, seed=self.seed, number=number)
+            stored, truth = _stored_views(folder, case, seed=self.seed, number=number)
+            exact_steps = _EXACT_STEPS if number < _ROOMS_WITH_ERROR and case.rounds == 1 else 0
             for build in builds:
-                results[build.name].append(build.complete(stored, truth, known, seed=self.seed + number))
-        return [self._row(build, results, builds[-1].name, f"{known}+{unknown}") for build in builds]
+                answer = build.complete(stored, truth, case, seed=self.seed + number, exact_steps=exact_steps)
+                results[build.name].append(answer)
+            stored.unlink()
+        return [self._row(build, results, builds[-1].name, case.text) for build in builds]
 
     def _training_rows(self, this: _Build, other: _Build) -> list[dict[str, Any]]:
         """Both builds' training steps; the loss is a running mean over all of them."""
@@ -110,6 +118,7 @@ class Builds(TableFiles):
 
         mine, theirs = found[build.name], found[against]
         psnrs = [one["psnr"] for one in mine]
+        errors = [one["latent_error"] for one in mine if "latent_error" in one]
         gains = [one["psnr"] - other["psnr"] for one, other in zip(mine, theirs, strict=True)]
         times = [other["cpu_seconds"] / one["cpu_seconds"] for one, other in zip(mine, theirs, strict=True)]
         return {
@@ -118,6 +127,7 @@ class Builds(TableFiles):
             "rooms": len(mine), "cpu_seconds": median(one["cpu_seconds"] for one in mine),
             "seconds": median(one["seconds"] for one in mine), "psnr": mean(psnrs),
             "psnr_error": _standard_error(psnrs),
+            "latent_error": mean(errors) if errors else None,
             "times_as_fast": median(times), "psnr_gain": mean(gains), "psnr_gain_error": _standard_error(gains),
         }  # fmt: skip
 
@@ -141,15 +151,24 @@ class _Build:
         self._process.kill()
         self._process.communicate()
 
-    def complete(self, stored: Path, truth: Float[Tensor, "m 3 h w"], known: int, *, seed: int) -> dict[str, float]:
-        """Seconds, CPU seconds and PSNR of the unknown views."""
+    def complete(
+        self, stored: Path, truth: Float[Tensor, "m 3 h w"], case: _Case, *, seed: int, exact_steps: int
+    ) -> dict[str, float]:
+        """Seconds, CPU seconds and PSNR of the unknown views; with ``exact_steps`` also how far their latents are from
+        those of so many steps.
+        """
         import numpy as np
         import torch
 
         from fb_core.evaluation.metrics.image_metrics import psnr
 
         answer = stored.with_suffix(".answer.npy")
-        took = self._asked({"views": str(stored), "known": known, "seed": seed, "answer": str(answer)})
+        took = self._asked(
+            {
+                "views": str(stored), "known": case.known, "unknown": case.unknown, "seed": seed,
+                "answer": str(answer), "exact_steps": exact_steps,
+            }
+        )  # fmt: skip
         return took | {"psnr": float(psnr(torch.from_numpy(np.load(answer)), truth).mean())}
 
     def trained(self) -> dict[str, Any]:
@@ -171,29 +190,42 @@ class _Build:
         )
 
 
-def _case_of(text: str) -> tuple[int, int]:
-    try:
-        known, unknown = map(int, text.split("+"))
-    except ValueError:
-        known = unknown = 0
-    if not (1 <= known <= 1000 and 1 <= unknown <= 1000):
-        raise ValueError(f"cases: expected KNOWN+UNKNOWN views such as 16+24, got {text!r}")
-    return known, unknown
+@dataclass(frozen=True, kw_only=True)
+class _Case:
+    """What is sampled."""
+
+    text: str
+    """As it was asked for."""
+    known: int
+    """Views that are known, the same in all rounds."""
+    unknown: int
+    """Views to be generated in each round."""
+    rounds: int
+
+    @staticmethod
+    def of(text: str) -> _Case:
+        """Raises ValueError for what names no case."""
+        found = re.fullmatch(r"(\d{1,4})\+(\d{1,4})(?:x(\d{1,3}))?", text)
+        known, unknown, rounds = (0, 0, 0) if found is None else (int(part or 1) for part in found.groups())
+        if not (1 <= known <= 1000 and 1 <= unknown <= 1000 and 1 <= rounds <= 100):
+            raise ValueError(
+                f"cases: expected KNOWN+UNKNOWN views such as 16+24, got {text!r}; 16+24x4 are four rounds of them"
+            )
+        return _Case(text=text, known=known, unknown=unknown, rounds=rounds)
 
 
-def _stored_views(
-    folder: Path, known: int, unknown: int, *, seed: int, number: int
-) -> tuple[Path, Float[Tensor, "m 3 h w"]]:
-    """A file with the views of an unseen room, and the truth of the unknown ones."""
+def _stored_views(folder: Path, case: _Case, *, seed: int, number: int) -> tuple[Path, Float[Tensor, "m 3 h w"]]:
+    """A file with the views of an unseen room, and the truth of the unknown ones of all rounds."""
     import numpy as np
 
     from fb_core.evaluation.completion import unseen_room
     from fb_core.geometry.raymap import raymaps_of
 
-    room = unseen_room(family="narrow", seed=seed, number=number, views=known + unknown, size=64)
-    path = folder / f"{known}+{unknown}-{number}.npz"
+    views = case.known + case.rounds * case.unknown
+    room = unseen_room(family="narrow", seed=seed, number=number, views=views, size=64)
+    path = folder / f"{case.text}-{number}.npz"
     np.savez(path, images=room.images.numpy(), raymaps=raymaps_of(room.cameras).float().numpy())
-    return path, room.images[known:]
+    return path, room.images[case.known :]
 
 
 def _standard_error(values: list[float]) -> float:

@@ -6,9 +6,11 @@ import json
 import pytest
 from helpers.tiny_models import save_tiny_model
 
+from fb_core.inpainter import Fillerbuster
 from fb_core.sampling import SOLVERS
 from method_configs.benchmarks.sampler import solvers_and_grids as benchmark_sampler
 from method_configs.benchmarks.sampler.solvers_and_grids import QUICK, SamplerBenchmark, run_sampler
+from method_configs.benchmarks.sampler.steps_by_task import run_tasks
 from method_configs.commands import command_line as commands
 
 
@@ -76,3 +78,33 @@ def test_nonsense_is_refused(nonsense):
 def test_a_start_that_is_none_is_refused(strength):
     with pytest.raises(ValueError, match="expected a strength between 0 and 1"):
         SamplerBenchmark(strength=strength)
+
+
+def test_without_guidance_it_measures_the_steps_of_every_task(tmp_path):
+    files = ["--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")]
+    commands.main(
+        ["bench", "sampler", "--guidance", "--quick", "--problems", "1", "--views", "2", "--size", "32", *files]
+    )
+    rows = json.loads((tmp_path / "s.json").read_text())["rows"]
+    assert [(row["part"].split(": ")[1], row["steps"]) for row in rows] == [
+        (task, steps) for task in ("pictures (rays known)", "raymaps (pictures known)", "both") for steps in (1, 2)
+    ]
+    assert all(0 < row["latent_error"] < 2 for row in rows)
+    assert (
+        ["psnr" in row for row in rows] == ["degrees_to_exact" not in row for row in rows] == 2 * [True] + 4 * [False]
+    )
+    assert (tmp_path / "s.png").stat().st_size > 1000
+
+
+def test_as_many_steps_as_the_exact_ones_have_no_error():
+    model = Fillerbuster.from_pretrained()
+    report = run_tasks(model, rooms=1, views=2, size=32, seed=0, steps=(3, 3))
+    assert all(row["latent_error"] == 0 and row.get("degrees_to_exact", 0.0) < 0.05 for row in report.rows)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"), [({"rooms": 0, "views": 2}, "one room"), ({"rooms": 1, "views": 1}, "two")]
+)
+def test_tasks_need_a_room_and_two_views(options, said):
+    with pytest.raises(ValueError, match=said):
+        run_tasks(Fillerbuster.from_pretrained(), size=32, seed=0, **options)

@@ -11,6 +11,7 @@ from helpers.scenes.mixed_views import cameras, mixed_views, seeded
 from helpers.tiny_models import tiny_model
 
 from fb_core.inpainter import Fillerbuster, SamplingConfig, noise_of
+from fb_core.sampling.guidance import GuidanceVariant
 from fb_core.views import Views
 
 QUICK = SamplingConfig(steps=2, guidance_unknown=3.0)
@@ -236,6 +237,17 @@ def test_known_latents_may_be_imposed(model):
     imposed = model.complete(views, generator=seeded(), sampling=dataclasses.replace(QUICK, known="imposed"))
     assert torch.equal(imposed.images * views.image_known, views.images * views.image_known)
     assert not torch.equal(imposed.images, plain.images)
+
+
+@pytest.mark.parametrize("change", [{}, {"window": 2}, {"guidance": GuidanceVariant(rescale=0.5)}])
+def test_where_known_latents_are_imposed_what_nobody_asks_for_changes_nothing(model, monkeypatch, change):
+    sampling = dataclasses.replace(QUICK, known="imposed", solver="corrected", **change)
+    denoising = model.denoising(mixed_views(), seed=0, sampling=sampling)
+    asked = denoising._asked()
+    assert (asked is None) == ("guidance" in change) and (asked is None or 0 < int(asked.sum()) < asked.numel())
+    latents = denoising.run()
+    monkeypatch.setattr(type(denoising), "_asked", lambda self: None)
+    torch.testing.assert_close(latents, denoising.run(), atol=1e-4, rtol=1e-5)
 
 
 def test_reference_compatible_is_the_original_s_way_not_ours(model):

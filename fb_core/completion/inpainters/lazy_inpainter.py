@@ -1,5 +1,5 @@
 """The diffusion model, loaded when it is first asked to complete something: rounds from the cache need only its
-name.
+name. Its rounds share what they show the networks alike.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from fb_core import checkpoint
 from fb_core.completion.duration import SquareSequence, seconds_of
 from fb_core.inpainter import BUNDLED_MODEL, Fillerbuster, SamplingConfig
 from fb_core.memory import budget as memory
+from fb_core.networks.shared_results import LIMIT_BYTES, SharedResults
 from fb_core.views import Views
 
 
@@ -54,6 +55,7 @@ class LazyInpainter:
         """
         device, dtype = torch.device(self._device), torch.float32
         needed = memory.estimate(views, (size, size), dtype, model=self._config, sampling=sampling, prompted=prompted)
+        needed = needed.beside(LIMIT_BYTES, sampling.memory_budget_bytes)
         sequence = SquareSequence(views=views, known=known, side=size)
         return seconds_of(self._config, device, dtype, sequence, sampling), needed.peak
 
@@ -92,4 +94,5 @@ class LazyInpainter:
             self._model = Fillerbuster.from_pretrained(
                 self._folder, device=self._device, text_encoder=self._text_encoder
             )
+            self._model.shared = SharedResults()
         return self._model

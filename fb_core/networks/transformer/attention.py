@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from fb_core.networks.transformer.cpu_kernels import attended, rms_normed
 from fb_core.networks.transformer.embeddings import at_least_float32
-from fb_core.networks.transformer.gradients import attended, rms_normed
 from fb_core.networks.transformer.ray_frames import RayFrames, transformed
 
 EPS = 1e-5
@@ -63,12 +63,14 @@ class Attention(nn.Module):
         return self.norm_q(self._split(self.to_q(x))).to(dtype)
 
     def queries_keys_values(
-        self, x: Float[Tensor, "b tokens d"], frames: RayFrames | None
-    ) -> tuple[Float[Tensor, "b heads tokens k"], KeysValues]:
-        """What every token asks and answers, told in the frames of their rays (see
-        `fb_core.networks.transformer.ray_frames`).
+        self, x: Float[Tensor, "b tokens d"], frames: RayFrames | None, asked: Int[Tensor, "some"] | None = None
+    ) -> tuple[Float[Tensor, "b heads some k"], KeysValues]:
+        """What every token asks (or those alone that are ``asked`` for) and answers, told in the frames of their rays
+        (see `fb_core.networks.transformer.ray_frames`).
         """
         own = self.own_keys_values(x, frames)
+        if asked is not None:
+            x, frames = x[:, asked], None if frames is None else frames.of_some(asked)
         queries = self.queries(x, own.values.dtype)
         return (queries if frames is None else transformed(queries, frames.inverse.mT)), own
 
@@ -83,11 +85,19 @@ class Attention(nn.Module):
         return self.to_out[0](rearrange(y, "b heads tokens k -> b tokens (heads k)"))
 
     def forward(
-        self, x: Float[Tensor, "b tokens d"], context: KeysValues | None = None, frames: RayFrames | None = None
-    ) -> Float[Tensor, "b tokens d"]:
-        """What every token gathers from `context`, or from all tokens, whose frames then count."""
+        self,
+        x: Float[Tensor, "b tokens d"],
+        context: KeysValues | None = None,
+        frames: RayFrames | None = None,
+        asked: Int[Tensor, "some"] | None = None,
+    ) -> Float[Tensor, "b some d"]:
+        """What every token, or of all tokens those that are ``asked`` for, gathers from `context`, or from all tokens,
+        whose frames then count.
+        """
         if context is None:
-            queries, context = self.queries_keys_values(x, frames)
+            queries, context = self.queries_keys_values(x, frames, asked)
+            if asked is not None and frames is not None:
+                frames = frames.of_some(asked)
         else:
             queries = self.queries(x, context.values.dtype)
         return self.answered(attended(queries, *context), frames)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from fb_core.networks.transformer.attention import EPS, Attention, KeysValues, RMSNorm
@@ -123,19 +123,23 @@ class Block(nn.Module):
         text: KeysValues | None,
         frames: RayFrames | None = None,
         relation: Relation | None = None,
-    ) -> Float[Tensor, "b tokens d"]:
+        asked: Int[Tensor, "some"] | None = None,
+    ) -> Float[Tensor, "b some d"]:
         """The residual stream after this block, given its norms' modulation and the text's keys and values (None
         without text).
 
         `frames` are those of the tokens' rays. A `relation` says whom the tokens attend to instead of one another, and
-        in which frames.
+        in which frames. Without one, only tokens that are ``asked`` for may be computed: the others then just answer.
         """
         each = scale_shifts.unbind()  # one gradient for all norms; picked one by one, each would make a whole one
         normed = self.norm1(x, each[0])
         if relation is not None and relation.last is self.attn1:
             relation.keep(self.attn1, normed)
             return x
-        x = x + (self.attn1(normed, None, frames) if relation is None else relation.gathered(self.attn1, normed))
+        if relation is None:
+            x = (x if asked is None else x[:, asked]) + self.attn1(normed, None, frames, asked)
+        else:
+            x = x + relation.gathered(self.attn1, normed)
         if text is not None:
             normed = self.norm2(x, each[1])
             x = x + (self.attn2(normed, text) if relation is None else relation.read(self.attn2, normed, text))

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple, cast, get_args
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from fb_core.networks.transformer.attention import Attention, KeysValues
@@ -22,17 +22,15 @@ from fb_core.networks.transformer.blocks import Block, Modulation, modulated
 from fb_core.networks.transformer.embeddings import (
     INDEX_MODES,
     IndexMode,
+    TimeEmbedding,
     at_least_float32,
     index_positions,
     layout_embedding,
     sincos,
-    timestep_embedding,
 )
 from fb_core.networks.transformer.known_tokens import Relation, Stream, streams
 from fb_core.networks.transformer.ray_frames import VECTOR, RayFrames
 
-TIME_SCALE = 1000.0
-TIME_CHANNELS = 256
 FINAL_EPS = 1e-6
 KnownTokens = Literal["joint", "apart"]
 """Whether tokens of which everything is known are denoised with all others, as released, or see one another alone, free
@@ -114,6 +112,10 @@ class TokenFacts(NamedTuple):
     """
     sequences_per_scene: int = 1
     """Sequences in a row that know the same, such as draws of noise for one training sequence."""
+    asked: Bool[Tensor, "n h w"] | None = None
+    """Tokens whose velocity matters, of every sequence; None = all. Where known tokens are joint the last block is
+    computed for these alone, and the velocity of the others is 0.
+    """
 
 
 NO_FACTS = TokenFacts()
@@ -126,28 +128,6 @@ class PatchEmbedding(nn.Module):
     def __init__(self, config: DiTConfig):
         super().__init__()
         self.proj = nn.Conv2d(config.in_channels, config.width, config.patch, stride=config.patch)
-
-
-class TimestepEmbedder(nn.Module):
-    """Two layers on the sinusoidal timestep."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.linear_1 = nn.Linear(TIME_CHANNELS, width)
-        self.linear_2 = nn.Linear(width, width)
-
-    def forward(self, time: Float[Tensor, "b"]) -> Float[Tensor, "b d"]:
-        """Embedding of times in [0, 1]."""
-        embedding = timestep_embedding(TIME_SCALE * time.to(at_least_float32(time.dtype)), TIME_CHANNELS)
-        return self.linear_2(F.silu(self.linear_1(embedding.to(self.linear_1.weight.dtype))))
-
-
-class TimeEmbedding(nn.Module):
-    """Holds the time layers under their name in the checkpoint."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.timestep_embedder = TimestepEmbedder(width)
 
 
 class DiT(nn.Module):
@@ -318,9 +298,14 @@ class DiT(nn.Module):
         modulation: Modulation,
         contexts: Sequence[KeysValues | None],
         frames: RayFrames | None = None,
+        asked: Int[Tensor, "some"] | None = None,
     ) -> Float[Tensor, "b tokens out"]:
-        """Patches of velocity of tokens that carry their positions."""
-        return self._patches(self._through_blocks(tokens, modulation.blocks, contexts, frames), modulation.final)
+        """Patches of velocity of tokens that carry their positions; zeros but for the tokens that are ``asked`` for."""
+        last = self._through_blocks(tokens, modulation.blocks, contexts, frames, asked=asked)
+        patches = self._patches(last, modulation.final)
+        if asked is None:
+            return patches
+        return patches.new_zeros(*tokens.shape[:2], patches.shape[-1]).index_copy(1, asked, patches)
 
     def _through_blocks(
         self,
@@ -329,10 +314,14 @@ class DiT(nn.Module):
         contexts: Sequence[KeysValues | None],
         frames: RayFrames | None = None,
         relation: Relation | None = None,
-    ) -> Float[Tensor, "b tokens d"]:
-        for block, modulation, context in zip(self.blocks, modulations, contexts, strict=True):
+        asked: Int[Tensor, "some"] | None = None,
+    ) -> Float[Tensor, "b some d"]:
+        """The tokens after all blocks, or those alone that are ``asked`` for."""
+        *earlier, last = zip(self.blocks, modulations, contexts, strict=True)
+        for block, modulation, context in earlier:
             tokens = block(tokens, modulation, context, frames, relation)
-        return tokens
+        block, modulation, context = last
+        return block(tokens, modulation, context, frames, relation, asked)
 
     def run_known(
         self,

@@ -10,9 +10,10 @@ import math
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from einops import repeat
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 IndexMode = Literal["flexible", "fixed", "none"]
 """How views are told apart: random positions in training, evenly spaced ones always, or not at all."""
@@ -22,6 +23,8 @@ INDEX_MODES: tuple[IndexMode, ...] = ("flexible", "fixed", "none")
 
 MAX_PERIOD = 10000.0
 ANGLE_SCALE = 10.0
+TIME_SCALE = 1000.0
+TIME_CHANNELS = 256
 
 
 def at_least_float32(dtype: torch.dtype) -> torch.dtype:
@@ -97,3 +100,25 @@ def timestep_embedding(timesteps: Float[Tensor, "b"], channels: int) -> Float[Te
     steps = torch.arange(channels // 2, device=timesteps.device, dtype=timesteps.dtype)
     angles = timesteps[:, None] * torch.exp(-math.log(MAX_PERIOD) * steps / (channels // 2))
     return torch.cat([angles.cos(), angles.sin()], dim=-1)
+
+
+class TimestepEmbedder(nn.Module):
+    """Two layers on the sinusoidal timestep."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.linear_1 = nn.Linear(TIME_CHANNELS, width)
+        self.linear_2 = nn.Linear(width, width)
+
+    def forward(self, time: Float[Tensor, "b"]) -> Float[Tensor, "b d"]:
+        """Embedding of times in [0, 1]."""
+        embedding = timestep_embedding(TIME_SCALE * time.to(at_least_float32(time.dtype)), TIME_CHANNELS)
+        return self.linear_2(F.silu(self.linear_1(embedding.to(self.linear_1.weight.dtype))))
+
+
+class TimeEmbedding(nn.Module):
+    """Holds the time layers under their name in the checkpoint."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.timestep_embedder = TimestepEmbedder(width)

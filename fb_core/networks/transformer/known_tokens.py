@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fb_core.networks.transformer.attention import Attention, KeysValues
-from fb_core.networks.transformer.gradients import attended
+from fb_core.networks.transformer.cpu_kernels import attended
 from fb_core.networks.transformer.ray_frames import RayFrames
 
 

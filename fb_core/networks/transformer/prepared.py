@@ -13,12 +13,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fb_core.networks.shared_results import SharedResults
 from fb_core.networks.transformer.attention import Attention, KeysValues
 from fb_core.networks.transformer.blocks import Modulation
 from fb_core.networks.transformer.dit import NO_FACTS, DiT, TokenFacts
@@ -52,6 +54,8 @@ class _Bound:
     """What attention is told in."""
     apart: _Apart | None
     """None where no known token stands apart."""
+    asked: Int[Tensor, "some"] | None
+    """Places of the tokens whose velocity matters; None is all."""
 
 
 class Prepared:
@@ -70,6 +74,7 @@ class Prepared:
         text: Float[Tensor, "texts words t"] | None = None,
         branches_at_once: int | None = None,
         facts: TokenFacts = NO_FACTS,
+        shared: SharedResults | None = None,
     ):
         """Compute the constants.
 
@@ -81,6 +86,7 @@ class Prepared:
             text: one embedding for all branches or one for each; None for a network without text.
             branches_at_once: branches that are evaluated as one batch; None is all of them, 1 needs the least memory.
             facts: what is known of the tokens of every branch, for networks that read it.
+            shared: keys and values of known tokens, to be used again where the same ones are known in another sampling.
 
         Raises ValueError if the conditioning has no branch or other channels than the network expects, or if the texts
         are not one or b.
@@ -98,6 +104,9 @@ class Prepared:
         self.branches_at_once = branches_at_once or branches
         self._size = height, width
         self._facts = facts
+        joint = dit.config.known_tokens == "joint"
+        self._asked = facts.asked if joint and facts.asked is not None and not bool(facts.asked.all()) else None
+        self._shared = shared
         self._told = conditioning[:, :, :noisy] if dit.known_of(facts) is not None else None
         self._bound: dict[tuple[int, int], _Bound] = {}
         self._tokens = rearrange(
@@ -142,7 +151,7 @@ class Prepared:
         """The velocity of some branches, given what their tokens share."""
         tokens, apart = shared + bound.tokens, bound.apart
         if apart is None:
-            patches = self.dit.run_blocks(tokens, modulation, bound.contexts, bound.frames)
+            patches = self.dit.run_blocks(tokens, modulation, bound.contexts, bound.frames, bound.asked)
             return self.dit.unpatchify(patches, len(state), *self._size)
         patches = self.dit.run_unknown(tokens, apart.others, apart.looked_up, modulation, bound.contexts, bound.frames)
         velocity = self.dit.unpatchify(patches, len(state), *self._size)
@@ -173,12 +182,31 @@ class Prepared:
                 known=known,
                 told=known_latents,
                 others=others,
-                looked_up=self.dit.run_known(clean, stream, contexts, frames),
+                looked_up=self._looked_up(clean, stream, contexts, frames),
             )
-        bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart)
+        asked = self._asked
+        if asked is not None:
+            asked = (asked if views is None else asked[views]).flatten().nonzero()[:, 0]
+        bound = _Bound(tokens=tokens, contexts=contexts, frames=frames, apart=apart, asked=asked)
         if views is None:
             self._bound[part.start, part.stop] = bound
         return bound
+
+    def _looked_up(
+        self,
+        tokens: Float[Tensor, "b tokens d"],
+        stream: Stream,
+        contexts: Sequence[KeysValues | None],
+        frames: RayFrames | None,
+    ) -> dict[Attention, list[KeysValues]]:
+        """All that other tokens see of known ones, computed or shared."""
+        compute = partial(self.dit.run_known, tokens, stream, contexts, frames)
+        if self._shared is None:
+            return compute()
+        half = torch.is_autocast_enabled(tokens.device.type) and torch.get_autocast_dtype(tokens.device.type)
+        deciding = [stream.taken(tokens), None if frames is None else frames.chosen(stream.places).frame]
+        deciding += [values for context in contexts if context is not None for values in context]
+        return self._shared.of(compute, f"known tokens {half} {stream.scenes}", *deciding)
 
     def only(self, branches: slice) -> Prepared:
         """The same with some of its branches; shares all constants, so it costs nothing."""

@@ -56,6 +56,10 @@ class RayFrames(NamedTuple):
         inverse[..., 3, 3] = 1.0
         return RayFrames(frame, inverse)
 
+    def of_some(self, places: Tensor) -> RayFrames:
+        """Those of the tokens at these places of every sequence."""
+        return RayFrames(*(values[:, places] for values in self))
+
     def chosen(self, places: Tensor) -> RayFrames:
         """One sequence of the tokens at these places of all sequences in a row."""
         return RayFrames(*(values.flatten(0, 1)[places][None] for values in self))

@@ -32,7 +32,7 @@ class Sampler:
     flow_only: bool = False
     """Leave the model out and measure the solvable flow alone."""
     guidance: tuple[float, ...] = (1.0, 3.0, 7.0)
-    """Guidance scales."""
+    """Guidance scales; none at all: only the steps that the model deserves, by task."""
     fine_steps: int = 1000
     """Steps of the solution that errors are measured against."""
     problems: int = 2
@@ -45,13 +45,18 @@ class Sampler:
     """Decides flows, rooms and noise."""
 
     def run(self) -> None:
-        """Measure and report."""
+        """Measure and report.
+
+        Raises ValueError for options that make no benchmark.
+        """
         import dataclasses
 
         from fb_core.inpainter import Fillerbuster
         from method_configs.benchmarks.command import show
         from method_configs.benchmarks.sampler import solvers_and_grids as benchmark
 
+        if not self.guidance:
+            return self._run_tasks()
         config = dataclasses.replace(benchmark.QUICK, seed=self.seed)
         if not self.quick:
             names = ("guidance", "fine_steps", "problems", "views", "size", "seed")
@@ -61,6 +66,22 @@ class Sampler:
         report = benchmark.run_sampler(config, model, on_cell=lambda cell: _logger.info("measuring %s", cell))
         figure = self.figure
         show(report, self.json, [] if figure is None else [lambda: draw(report, figure)])
+
+    def _run_tasks(self) -> None:
+        from fb_core.inpainter import Fillerbuster
+        from method_configs.benchmarks.command import show
+        from method_configs.benchmarks.sampler.steps_by_task import STEPS, draw_tasks, run_tasks
+
+        if self.flow_only:
+            raise ValueError("guidance: without any there is only the model to measure; leave --flow-only out")
+        report = run_tasks(
+            Fillerbuster.from_pretrained(self.model),
+            rooms=self.problems, views=self.views, size=self.size, seed=self.seed,
+            on_cell=lambda cell: _logger.info("measuring %s", cell),
+            steps=(1, 2, 3) if self.quick else STEPS,
+        )  # fmt: skip
+        figure = self.figure
+        show(report, self.json, [] if figure is None else [lambda: draw_tasks(report, figure)])
 
 
 def draw(report: Report, path: Path) -> None:

@@ -27,6 +27,7 @@ from fb_core.sampling.options import SamplingConfig
 from fb_core.sampling.starts import imposed
 from fb_core.views import Views
 from method_configs.benchmarks.sampler.solvable_flows import Mixture, fine_endpoint, guided_flow
+from method_configs.benchmarks.sampler.steps_by_task import degrees
 
 REFERENCE_PASSES = 3
 """Passes that the original takes a step."""
@@ -329,8 +330,8 @@ def _measure_poses(report: Report, config: SamplerBenchmark, model: Fillerbuster
                 ).raymaps[1:, 3:]
 
             directions, fine = rays(steps), rays(4 * max(config.pose_steps))
-            own += _degrees(directions, fine) / config.problems
-            true += _degrees(directions, views.raymaps[1:, 3:]) / config.problems
+            own += degrees(directions, fine) / config.problems
+            true += degrees(directions, views.raymaps[1:, 3:]) / config.problems
         report.rows.append(
             {
                 "part": "raymaps of views beside one that is posed",
@@ -339,9 +340,3 @@ def _measure_poses(report: Report, config: SamplerBenchmark, model: Fillerbuster
                 "degrees_to_truth": true,
             }
         )
-
-
-def _degrees(first: Tensor, second: Tensor) -> float:
-    """Mean angle between directions."""
-    cosine = torch.nn.functional.cosine_similarity(first, second, dim=1).clamp(-1, 1)
-    return float(torch.rad2deg(torch.arccos(cosine)).mean())

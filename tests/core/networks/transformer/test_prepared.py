@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.tiny_models import network_of
 
-from fb_core.networks.transformer.dit import DiT, DiTConfig
+from fb_core.networks.transformer.dit import DiT, DiTConfig, TokenFacts
 from fb_core.networks.transformer.prepared import Prepared
 
 WITHOUT_TEXT = DiTConfig(heads=2, head_dim=8, depth=2, in_channels=10, out_channels=4, text_width=0)
@@ -105,3 +105,35 @@ def test_what_does_not_fit_is_refused(monkeypatch, state, conditioning):
     prepared = Prepared(network, conditioning, TIMES, text=text[:1])
     with pytest.raises(ValueError, match="state: expected 5 views, got 4"):
         prepared(state[:4], 1.0)
+
+
+@pytest.mark.parametrize("texts", [0, 3])
+@pytest.mark.parametrize("ray_frames", [False, True])
+@pytest.mark.parametrize("branches_at_once", [None, 1])
+@torch.no_grad()
+def test_tokens_that_nobody_asks_for_end_in_the_last_block(state, conditioning, texts, ray_frames, branches_at_once):
+    config = dataclasses.replace(WITH_TEXT if texts else WITHOUT_TEXT, ray_frames=ray_frames)
+    network, text = network_of(config), torch.randn(texts, 7, 5, dtype=torch.float64) if texts else None
+    frames = torch.eye(4, dtype=torch.float64).repeat(3, 5, 2, 3, 1, 1)
+    frames[..., :3, 3] = torch.randn(3, 5, 2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    asked = torch.rand(5, 2, 3, generator=torch.Generator().manual_seed(6)) > 0.5
+    options = {"text": text, "branches_at_once": branches_at_once}
+    whole = Prepared(network, conditioning, TIMES, facts=TokenFacts(frames=frames), **options)
+    some = Prepared(network, conditioning, TIMES, facts=TokenFacts(frames=frames, asked=asked), **options)
+    for views in (None, torch.tensor([4, 1, 2])):
+        chosen = slice(None) if views is None else views
+        expected, got = (one(state[chosen], 0.4, views) for one in (whole, some))
+        latents = asked[chosen].repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)[None, :, None].expand_as(got)
+        torch.testing.assert_close(got[latents], expected[latents])
+        assert not bool(got[~latents].any())
+
+
+@torch.no_grad()
+def test_nobody_asked_for_or_all_asked_for(state, conditioning):
+    network = network_of(WITHOUT_TEXT)
+    every, none = torch.ones(5, 2, 3, dtype=torch.bool), torch.zeros(5, 2, 3, dtype=torch.bool)
+    plain_velocity = Prepared(network, conditioning, TIMES)(state, 1.0)
+    assert torch.equal(
+        Prepared(network, conditioning, TIMES, facts=TokenFacts(asked=every))(state, 1.0), plain_velocity
+    )
+    assert not bool(Prepared(network, conditioning, TIMES, facts=TokenFacts(asked=none))(state, 1.0).any())

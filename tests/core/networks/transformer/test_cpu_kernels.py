@@ -6,8 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from fb_core.networks.transformer import gradients
-from fb_core.networks.transformer.gradients import attended, rms_normed
+from fb_core.networks.transformer import cpu_kernels
+from fb_core.networks.transformer.cpu_kernels import attended, rms_normed
 
 
 def drawn(*shape: int, seed: int, dtype: torch.dtype) -> torch.Tensor:
@@ -68,10 +68,10 @@ def test_all_other_attention_is_torchs(case, monkeypatch):
     def never(*_):
         raise AssertionError("this attention is torch's own")
 
-    monkeypatch.setattr(gradients._Attended, "apply", never)
+    monkeypatch.setattr(cpu_kernels._Attended, "apply", never)
     dtype = torch.float32 if case == "float32" else torch.bfloat16
     if case == "long":
-        monkeypatch.setattr(gradients, "_MOST_SCORES", 2 * 4 * 3 * 5 - 1)
+        monkeypatch.setattr(cpu_kernels, "_MOST_SCORES", 2 * 4 * 3 * 5 - 1)
     inputs = [drawn(2, 4, size, 8, seed=size, dtype=dtype) for size in (3, 5, 5)]
     if case.startswith("nobody"):
         inputs = [values.detach() for values in inputs]
