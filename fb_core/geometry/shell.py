@@ -94,8 +94,9 @@ def fit_shell(
         fallback_radius: radius of the sphere that is returned when there is no usable point at all.
         up: unit direction; when given, a flat floor or ceiling among the points goes on where none was seen.
         standing: where people stood with their cameras, who had room around them: where hardly any point tells of a
-            surface, none is nearer to them than 0.6 of the points' median distance from the centre (of rooms whose
-            walls are known, 1 % of the unseen directions are then further from the truth, and as many nearer to it).
+            surface, none is nearer to them than 0.6 of the points' median distance from the centre. (Of the unseen
+            directions of 20 rooms that were measured 3.7 % instead of 4.0 % are then a quarter too near, and as many as
+            before, 3.9 %, a third too far.)
         bandwidth_degrees: angular smoothing.
         fewest_points: with fewer usable points the result is a sphere at their median distance.
 
@@ -125,7 +126,8 @@ def fit_shell(
         away = (directions @ (standing.to(center) - center).T).amax(dim=1).clamp(min=0)
         nearest = (away + _ROOM_TO_STAND * float(distance.median())).log()
         typical = float(density.square().sum() / density.sum())  # of directions in which points lie
-        table = torch.where(density < _FEW * typical, torch.maximum(table, nearest), table)
+        lonely = (2 - density / (_FEW * typical)).clamp(0, 1)  # without a jump: worlds that differ by rounding agree
+        table = table + lonely * (nearest - table).clamp(min=0)
     if up is not None:
         for axis in (up, -up):
             table = torch.minimum(
