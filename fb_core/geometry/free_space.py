@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
 
+_BESIDE = 0.5  # of the extent of the capture
 _SHARE = 0.9  # of the way to a surface that counts as crossed, which leaves room for errors of depth
 
 
@@ -42,3 +44,19 @@ class FreeSpace:
             surface = depth[row, column].to(points)
             result[inside] |= torch.isfinite(surface) & (away[0][inside] < _SHARE * surface)
         return result
+
+
+def cameras_beside(cameras: Sequence[Pinholes]) -> list[Pinholes]:
+    """Where else people may look from: each camera (one per entry) moved to the left, the right, up and down by half of
+    the distance of the farthest camera from their middle. None where all stand in one place.
+    """
+    centers = torch.cat([camera.centers for camera in cameras]) if cameras else torch.empty(0, 3)
+    reach = _BESIDE * float((centers - centers.mean(dim=0)).norm(dim=1).max()) if len(centers) else 0.0
+    if reach <= 1e-6 * (1 + float(centers.abs().max() if len(centers) else 0.0)):
+        return []
+    return [
+        camera.moved(sign * reach * camera.rotations[0, :, axis])
+        for camera in cameras
+        for axis in (0, 1)
+        for sign in (-1, 1)
+    ]

@@ -24,6 +24,8 @@ _FLAT_SHARE, _FLAT_THICKNESS = (
     0.04,
     0.03,
 )  # a floor or ceiling: this share of all points within this part of their distance
+_ROOM_TO_STAND = 0.6  # of the median distance
+_FEW = 0.1  # of the density of points that is usual where there are any: splats that stand too near, mostly
 _BISECTIONS = 24
 
 
@@ -76,6 +78,7 @@ def fit_shell(
     center: Float[Tensor, "3"],
     fallback_radius: float,
     up: Float[Tensor, "3"] | None = None,
+    standing: Float[Tensor, "c 3"] | None = None,
     bandwidth_degrees: float = 5.0,
     fewest_points: int = 16,
 ) -> Shell:
@@ -90,6 +93,10 @@ def fit_shell(
             cameras.
         fallback_radius: radius of the sphere that is returned when there is no usable point at all.
         up: unit direction; when given, a flat floor or ceiling among the points goes on where none was seen.
+        standing: where people stood with their cameras, who had room around them: where hardly any point tells of a
+            surface, none is nearer to them than 0.6 of the points' median distance from the centre. (Of the unseen
+            directions of 20 rooms that were measured 3.7 % instead of 4.0 % are then a quarter too near, and as many as
+            before, 3.9 %, a third too far.)
         bandwidth_degrees: angular smoothing.
         fewest_points: with fewer usable points the result is a sphere at their median distance.
 
@@ -112,13 +119,15 @@ def fit_shell(
     log_distance = distance.log()
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))
     log_distance = log_distance.clamp(bounds[0], bounds[1])
-    directions = _table_directions(center)
-    table = torch.cat(
-        [
-            _near_by(part, offset / distance[:, None], log_distance, bandwidth_degrees)
-            for part in directions.split(_COLUMNS)
-        ]
-    )
+    directions, seen = _table_directions(center), offset / distance[:, None]
+    parts = [_near_by(part, seen, log_distance, bandwidth_degrees) for part in directions.split(_COLUMNS)]
+    table, density = (torch.cat(column) for column in zip(*parts, strict=True))
+    if standing is not None:
+        away = (directions @ (standing.to(center) - center).T).amax(dim=1).clamp(min=0)
+        nearest = (away + _ROOM_TO_STAND * float(distance.median())).log()
+        typical = float(density.square().sum() / density.sum())  # of directions in which points lie
+        lonely = (2 - density / (_FEW * typical)).clamp(0, 1)  # without a jump: worlds that differ by rounding agree
+        table = table + lonely * (nearest - table).clamp(min=0)
     if up is not None:
         for axis in (up, -up):
             table = torch.minimum(
@@ -132,14 +141,16 @@ def _near_by(
     points: Float[Tensor, "n 3"],
     values: Float[Tensor, "n"],
     bandwidth_degrees: float,
-) -> Float[Tensor, "m"]:
-    """Mean of the values of points (unit directions) about each direction, weighted by inverse angles. Asked for few
-    directions at a time, whose weights stay in the processor's cache.
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """Mean of the values of points (unit directions) about each direction, weighted by inverse angles, and the weight
+    of them all, which tells how densely they lie there. Asked for few directions at a time, whose weights stay in the
+    processor's cache.
     """
     # 1 - cos(angle) is half the squared angle for small angles.
     half_square = (directions @ points.T).clamp(max=1.0).neg_().add_(1.0)
     weight = half_square.add_(math.radians(bandwidth_degrees) ** 2 / 2).pow_(-_POWER)
-    return (weight @ values) / weight.sum(dim=1)
+    density = weight.sum(dim=1)
+    return (weight @ values) / density, density
 
 
 def intersect(

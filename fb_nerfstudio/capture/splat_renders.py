@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
@@ -26,6 +26,10 @@ FIRM = 0.75
 """
 TRAINED_STEPS = 100
 """Steps after which the splats' own depth and accumulation are believed."""
+_SAME_DEPTH = 0.1
+"""Of the depth, by which two cameras may differ about a surface: splats of some hundred steps are no better."""
+_FEWEST_BORNE_OUT = 0.2
+"""Share of a capture's surface that two cameras must agree on for the rest to be left out."""
 SMALL_SIDE = 64
 """Pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures."""
 
@@ -120,14 +124,39 @@ def render_geometry(splats: TrainedSplats, cameras: Pinholes) -> Rendered:
 def surface_points(splats: TrainedSplats, cameras: Sequence[Pinholes], *, limit: int = 20000) -> Float[Tensor, "m 3"]:
     """World points of what the splats show in the captured cameras (at most ``limit``, evenly spread over the
     pictures).
+
+    Where one camera alone shows something, splats may stand anywhere along its rays, and often stand close before it.
+    So a point counts when the depth in another camera bears it out; where hardly any is borne out (a single camera),
+    all count.
     """
-    groups = []
-    for camera in cameras:
-        small = coarse(camera)
-        rendered = render_geometry(splats, small)
-        groups.append(small.unproject(rendered.depth)[rendered.solid])
+    small = [coarse(camera) for camera in cameras]
+    depths = []
+    for camera in small:
+        rendered = render_geometry(splats, camera)
+        depths.append(torch.where(rendered.solid, rendered.depth, 0.0)[0])
+    groups = [camera.unproject(depth[None])[0][depth > 0] for camera, depth in zip(small, depths, strict=True)]
     points = torch.cat(groups) if groups else torch.empty(0, 3)
+    points = _evenly(points, limit)
+    borne_out = _showing(small, depths, points) > 1  # its own camera is one
+    return points[borne_out] if float(borne_out.float().mean()) > _FEWEST_BORNE_OUT else points
+
+
+def _evenly(points: Float[Tensor, "m 3"], limit: int) -> Float[Tensor, "_m 3"]:
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
+
+
+def _showing(
+    cameras: Sequence[Pinholes], depths: Sequence[Float[Tensor, "_h _w"]], points: Float[Tensor, "m 3"]
+) -> Int[Tensor, " m"]:
+    """How many of the cameras show each point: it lies in the picture, at the depth that stands there."""
+    number = torch.zeros(len(points), dtype=torch.int64)
+    for camera, depth in zip(cameras, depths, strict=True):
+        pixels, away = (one[0] for one in camera.project(points))
+        size = pixels.new_tensor([depth.shape[1], depth.shape[0]])
+        inside = ((pixels >= 0) & (pixels < size)).all(dim=-1) & (away > 0)
+        column, row = pixels[inside].long().unbind(dim=-1)
+        number[inside] += (depth[row, column] - away[inside]).abs() < _SAME_DEPTH * away[inside]
+    return number
 
 
 def free_space(splats: TrainedSplats, cameras: Sequence[Pinholes]) -> FreeSpace:

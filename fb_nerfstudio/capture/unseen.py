@@ -20,6 +20,7 @@ from torch import Tensor
 from fb_core.completion.results.completed_views import CompletedViews
 from fb_core.completion.seams import without_seams
 from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import Shell, intersect
 from fb_core.geometry.viewpoints.paths import seen_by
 from fb_core.masks import resampled
@@ -37,6 +38,15 @@ class Unseen:
     """True where unseen."""
     points: Float[Tensor, "n h w 3"]
     """World points of the pixels on the shell; infinite where a ray never meets it."""
+
+    def without(self, space: FreeSpace | None) -> Unseen:
+        """Less the pixels whose point lies in a space: what was captured stays in view, from beside the captured places
+        too, and nothing is put before it on a mere guess of where surfaces are. None leaves all.
+        """
+        if space is None:
+            return self
+        crossed = space.crossed(self.points.reshape(-1, 3).nan_to_num(posinf=1e6))
+        return dataclasses.replace(self, mask=self.mask & ~crossed.reshape(self.mask.shape))
 
 
 def coarse_mask(known: Float[Tensor, "1 h w"]) -> Bool[Tensor, "_h _w"] | None:

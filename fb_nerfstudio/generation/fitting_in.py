@@ -51,6 +51,7 @@ def fitted_in(
         return views, 0
     rendered = render_geometry(splats, coarse(views.cameras)) if scene.is_trained else None
     unseen = find_unseen(views.cameras, scene.cameras, shell, rendered, scene.known)
+    unseen = unseen.without(scene.space_in_view())
     views = with_pixel_trust(views, unseen, rendered, shell, curve)
     if config.match_colors and rendered is not None:
         views = with_matched_colors(views, unseen, rendered)

@@ -14,9 +14,10 @@ from torch import Tensor
 from fb_core.completion.options import CompletionConfig
 from fb_core.completion.planning.plan import CompletionPlan, plan_completion
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.free_space import FreeSpace
+from fb_core.geometry.free_space import FreeSpace, cameras_beside
 from fb_nerfstudio.capture.splat_renders import TRAINED_STEPS, TrainedSplats, free_space, surface_points
 
+_BESIDE_CAMERAS = 24  # captured places beside which it is looked from, in four directions each
 _SURVEYED_CAMERAS = 48  # captured pictures that are rendered to learn where surfaces and free space are
 _PLANNED_CAMERAS = 200  # the same, to plan new views: a capture of thousands costs no more than one of hundreds
 
@@ -73,6 +74,12 @@ class TrainedScene:
     def free_space(self) -> FreeSpace | None:
         """What is known to be empty; None before the splats are trained."""
         return free_space(self.splats, self.surveyed) if self.is_trained else None
+
+    def space_in_view(self) -> FreeSpace | None:
+        """What lies between places beside the captured ones and what the splats show from there; None before they are
+        trained.
+        """
+        return free_space(self.splats, cameras_beside(self._spread(_BESIDE_CAMERAS))) if self.is_trained else None
 
     def survey(self, config: CompletionConfig, *, size: int) -> CompletionPlan:
         """Shape, shell and context of the capture: a plan without rounds, for views of a size."""

@@ -334,8 +334,8 @@ def test_trained_splats_tell_where_the_holes_are(tiny_capture: Path):
     manager = make(tiny_capture, options(at_step=200, max_seed_gaussians=50), points=False)
     attrs = generated(manager, step=200)
     assert (
-        len(attrs.pipeline.model.modes) == 6 + 6 + 6
-    )  # captured views for the surface, new ones to start from and for the holes
+        len(attrs.pipeline.model.modes) == 6 + 6 + 6 + 4 * 6
+    )  # captured views for the surface, new ones to start from and for the holes, four places beside each captured one
     assert 0 < len(attrs.pipeline.model.added[0][0]) <= 50
 
 

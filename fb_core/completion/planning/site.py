@@ -81,7 +81,7 @@ class Site:
         seen = thinned_points(points, shape)
         return Site(
             shape=shape,
-            shell=shell_of(shape, seen),
+            shell=shell_of(shape, seen, torch.cat([camera.centers for camera in exact]) if shape.outward else None),
             points=seen,
             cameras=exact,
             known=known,
@@ -214,7 +214,9 @@ def thinned_points(points: Tensor | None, shape: CaptureShape) -> Float[Tensor, 
     return points[torch.linspace(0, len(points) - 1, min(len(points), _PLANNING_POINTS), dtype=torch.float64).long()]
 
 
-def shell_of(shape: CaptureShape, points: Tensor) -> Shell:
-    """The surface all around; without points, a sphere that leaves the cameras room."""
+def shell_of(shape: CaptureShape, points: Tensor, standing: Float[Tensor, "c 3"] | None = None) -> Shell:
+    """The surface all around, with room where people stood; without points, a sphere that leaves the cameras room."""
     guess = (3.0 if shape.outward else 2.0) * shape.radius
-    return fit_shell(points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up)
+    return fit_shell(
+        points, center=shape.center, fallback_radius=guess if guess > 1e-6 else 1.0, up=shape.up, standing=standing
+    )

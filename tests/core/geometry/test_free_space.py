@@ -14,7 +14,7 @@ from helpers.scenes.coverages import AUTO, UP, turning
 from fb_core.completion.planning.plan import plan_completion
 from fb_core.completion.rounds import announcement_of_rounds
 from fb_core.geometry.cameras import Pinholes
-from fb_core.geometry.free_space import FreeSpace
+from fb_core.geometry.free_space import FreeSpace, cameras_beside
 
 
 def looking_along_x(depth: float, side: int = 8) -> FreeSpace:
@@ -94,3 +94,21 @@ def test_where_nobody_can_tell_new_cameras_stay_at_captured_places_and_a_sentenc
 def test_an_allowed_collision_is_no_reason_to_stay() -> None:
     anywhere = dataclasses.replace(AUTO, placement=dataclasses.replace(AUTO.placement, clearance=0.0))
     assert not plan_completion(room_cameras(6), None, anywhere, size=16).blind
+
+
+def test_places_beside_a_capture_lie_to_all_sides_of_each_camera() -> None:
+    cameras = turning(5)
+    beside = cameras_beside(cameras)
+    centers = torch.cat([camera.centers for camera in cameras])
+    reach = 0.5 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
+    assert len(beside) == 20
+    for index, camera in enumerate(cameras):
+        steps = torch.cat([one.centers for one in beside[4 * index : 4 * index + 4]]) - camera.centers
+        assert torch.allclose(steps.norm(dim=1), torch.full((4,), reach).double(), rtol=1e-6)
+        assert torch.allclose(steps.sum(dim=0), torch.zeros(3).double(), atol=1e-9)
+        assert all(torch.equal(one.rotations, camera.rotations) for one in beside[4 * index : 4 * index + 4])
+
+
+def test_a_turn_on_the_spot_and_no_camera_have_nothing_beside() -> None:
+    one = turning(4)[0]
+    assert cameras_beside([one]) == [] and cameras_beside([one, one]) == [] and cameras_beside([]) == []

@@ -54,6 +54,29 @@ def test_unseen_directions_take_the_radii_of_the_seen_ones_nearby():
     assert 2.3 < behind[0] <= 3.0 and 1.0 <= behind[1] < 1.3
 
 
+def test_nothing_unseen_stands_close_to_where_people_stood():
+    unit = directions(20000)
+    wall = 2.0 * unit[unit[:, 0] > 0.3]
+    stray = 0.4 * unit[unit[:, 0] < -0.7][:200]  # splats close before a camera: 3 % of the points
+    standing = torch.tensor([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    points, behind = torch.cat([wall, stray]), torch.tensor([[-1.0, 0.0, 0.0]])
+    options = {"center": torch.zeros(3), "fallback_radius": 1.0}
+    assert float(fit_shell(points, **options).radius(behind)) < 0.5
+    assert float(fit_shell(points, standing=standing, **options).radius(behind)) > 0.3 + 0.55 * 2.0
+    ahead = unit[unit[:, 0] > 0.5]
+    assert torch.allclose(
+        fit_shell(points, standing=standing, **options).radius(ahead), fit_shell(points, **options).radius(ahead)
+    )
+
+
+def test_what_is_seen_close_by_stays_close():
+    """A desk before the camera is no stray: it is seen as densely as the rest."""
+    unit = directions(4000)
+    points = torch.where((unit[:, :1] > 0.8), 0.5, 2.0) * unit
+    shell = fit_shell(points, center=torch.zeros(3), fallback_radius=1.0, standing=torch.zeros(1, 3))
+    assert float(shell.radius(torch.tensor([[1.0, 0.0, 0.0]]))) < 0.55
+
+
 def test_a_few_stray_points_do_not_move_the_shell():
     unit = directions(1000)
     points = 2.0 * unit

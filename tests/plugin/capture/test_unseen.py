@@ -10,8 +10,10 @@ from helpers.plugin.datamanagers import (
     two_views,
 )
 
+from fb_core.geometry.cameras import Pinholes
+from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import sphere
-from fb_nerfstudio.capture.splat_renders import Rendered
+from fb_nerfstudio.capture.splat_renders import Rendered, surface_points
 from fb_nerfstudio.capture.unseen import find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
 
 # ---- unseen pixels --------------------------------------------------------------------------------------------------
@@ -44,3 +46,44 @@ def test_holes_of_trained_splats_are_unseen_and_so_is_what_no_camera_looked_at()
     assert not unseen.mask[0, :, :4].any() and unseen.mask[0, :, 4:].all() and unseen.mask[1].all()
     masked = with_unseen_masks(views, unseen)
     assert masked.masks[0, :, 4:].all() and not masked.masks[0, :, :4].any()
+
+
+def test_nothing_is_put_before_what_is_seen_from_beside_the_capture():
+    views = two_views()
+    unseen = find_unseen(views.cameras, [], sphere(torch.zeros(3), 3.0), None)
+    behind_a_wall = FreeSpace(cameras=(views.cameras[0],), depth=(torch.full((8, 8), 2.0),))
+    before_a_wall = FreeSpace(cameras=(views.cameras[0],), depth=(torch.full((8, 8), 9.0),))
+    assert unseen.mask.all() and torch.equal(unseen.without(None).mask, unseen.mask)
+    assert torch.equal(unseen.without(behind_a_wall).mask, unseen.mask)
+    left = unseen.without(before_a_wall).mask
+    assert not left[0].any() and left[1].all(), "the other view looks elsewhere"
+
+
+class Blobs(torch.nn.Module):
+    """Splats of a wall at z = 4, and of a blob at z = 1 that only the first of three cameras has before it."""
+
+    device = torch.device("cpu")
+
+    def get_outputs_for_camera(self, camera):
+        depth = torch.full((int(camera.height), int(camera.width), 1), 4.0)
+        if float(camera.camera_to_worlds[0, 0, 3]) < -0.5:
+            depth[:, :4] = 1.0
+        return {"depth": depth, "accumulation": torch.ones_like(depth), "rgb": depth.expand(-1, -1, 3) / 4}
+
+
+def three_cameras() -> list[Pinholes]:
+    pose = torch.cat([torch.eye(3), torch.zeros(3, 1)], dim=1)[None]
+    camera = Pinholes(
+        camera_to_world=pose, focal=torch.full((1, 2), 8.0), principal=torch.full((1, 2), 8.0), width=16, height=16
+    )
+    return [camera.moved(torch.tensor([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
+
+
+def test_a_surface_that_one_camera_alone_shows_is_none():
+    points = surface_points(Blobs(), three_cameras())
+    assert len(points) > 600 and bool((points[:, 2] == 4.0).all())
+
+
+def test_a_single_camera_is_believed():
+    points = surface_points(Blobs(), three_cameras()[:1])
+    assert len(points) == 256 and int((points[:, 2] == 1.0).sum()) == 64
