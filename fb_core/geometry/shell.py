@@ -119,21 +119,35 @@ def fit_shell(
     log_distance = distance.log()
     bounds = torch.quantile(log_distance, log_distance.new_tensor([_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]))
     log_distance = log_distance.clamp(bounds[0], bounds[1])
-    directions, seen = _table_directions(center), offset / distance[:, None]
-    parts = [_near_by(part, seen, log_distance, bandwidth_degrees) for part in directions.split(_COLUMNS)]
-    table, density = (torch.cat(column) for column in zip(*parts, strict=True))
+    directions = _table_directions(center)
+    table, density = _regressed(directions, offset / distance[:, None], log_distance, bandwidth_degrees)
     if standing is not None:
         away = (directions @ (standing.to(center) - center).T).amax(dim=1).clamp(min=0)
-        nearest = (away + _ROOM_TO_STAND * float(distance.median())).log()
-        typical = float(density.square().sum() / density.sum())  # of directions in which points lie
-        lonely = (2 - density / (_FEW * typical)).clamp(0, 1)  # without a jump: worlds that differ by rounding agree
-        table = table + lonely * (nearest - table).clamp(min=0)
+        table = _with_room(table, density, away + _ROOM_TO_STAND * float(distance.median()))
     if up is not None:
         for axis in (up, -up):
             table = torch.minimum(
                 table, _log_distance_to_plane(offset @ axis, float(distance.median()), directions @ axis)
             )
     return Shell(center=center, log_radius=table.reshape(_ROWS, _COLUMNS))
+
+
+def _with_room(
+    table: Float[Tensor, "m"], density: Float[Tensor, "m"], nearest: Float[Tensor, "m"]
+) -> Float[Tensor, "m"]:
+    """Logarithms of radii, at least those of ``nearest`` where hardly any point lies."""
+    typical = float(density.square().sum() / density.sum())  # of directions in which points lie
+    lonely = (2 - density / (_FEW * typical)).clamp(0, 1)  # without a jump: worlds that differ by rounding agree
+    return table + lonely * (nearest.log() - table).clamp(min=0)
+
+
+def _regressed(
+    directions: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"], values: Float[Tensor, "n"], bandwidth_degrees: float
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """What `_near_by` tells of all directions."""
+    parts = [_near_by(part, points, values, bandwidth_degrees) for part in directions.split(_COLUMNS)]
+    table, density = (torch.cat(column) for column in zip(*parts, strict=True))
+    return table, density
 
 
 def _near_by(

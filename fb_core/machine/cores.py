@@ -6,9 +6,8 @@ import math
 import os
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
-from fb_core.machine.resources import usable_cores
+from fb_core.machine.resources import busy_seconds, usable_cores
 
 _LOOKS_EVERY_SECONDS, _OLD_SECONDS = 5.0, 60.0
 _IDLE_SHARE = 0.3  # of a core that others may use while it still counts as free
@@ -40,7 +39,7 @@ def free_cores() -> int:
     before, now = _last_look, time.monotonic()
     if now - before.at <= _LOOKS_EVERY_SECONDS:
         return before.free
-    busy, own = _busy_seconds(), time.process_time()
+    busy, own = busy_seconds(), time.process_time()
     if busy is not None and before.busy is not None and now - before.at < _OLD_SECONDS:
         others = (busy - before.busy - (own - before.own)) / (now - before.at)
     else:
@@ -48,18 +47,3 @@ def free_cores() -> int:
     free = max(1, usable_cores() - max(0, math.ceil(others - _IDLE_SHARE)))
     _last_look = _Look(at=now, busy=busy, own=own, free=free)
     return free
-
-
-def _busy_seconds() -> float | None:
-    """Seconds that the cores which this process may use have worked, for whomever; None where the system does not
-    tell.
-    """
-    try:
-        lines = Path("/proc/stat").read_text(encoding="ascii").splitlines()
-        names = {f"cpu{number}" for number in os.sched_getaffinity(0)}
-        rows = [line.split() for line in lines if line.split()[:1] and line.split()[0] in names]
-        # user, nice, system, (idle, waiting,) interrupts of both kinds, and what the host gave to others
-        ticks = sum(int(row[column]) for row in rows for column in (1, 2, 3, 6, 7, 8))
-        return ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, AttributeError, IndexError, ValueError):
-        return None

@@ -43,6 +43,21 @@ def usable_cores() -> int:
     return max(1, len(affinity(0)) if affinity is not None else os.cpu_count() or 1)
 
 
+def busy_seconds() -> float | None:
+    """Seconds that the cores which this process may use have worked, for whomever; None where the system does not
+    tell.
+    """
+    try:
+        lines = Path("/proc/stat").read_text(encoding="ascii").splitlines()
+        names = {f"cpu{number}" for number in os.sched_getaffinity(0)}
+        rows = [line.split() for line in lines if line.split()[:1] and line.split()[0] in names]
+        # user, nice, system, (idle, waiting,) interrupts of both kinds, and what the host gave to others
+        ticks = sum(int(row[column]) for row in rows for column in (1, 2, 3, 6, 7, 8))
+        return ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError, IndexError, ValueError):
+        return None
+
+
 def peak_memory_bytes() -> int:
     """The largest resident size of this process since its start; 0 where the system does not tell (Windows)."""
     try:

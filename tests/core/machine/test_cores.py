@@ -13,7 +13,7 @@ def test_own_threads_leave_a_core_free_and_others_do_not(monkeypatch: pytest.Mon
     monkeypatch.setattr(cores, "usable_cores", lambda: 2)
     monkeypatch.setattr(cores.time, "monotonic", lambda: clock["monotonic"])
     monkeypatch.setattr(cores.time, "process_time", lambda: clock["process_time"])
-    monkeypatch.setattr(cores, "_busy_seconds", lambda: clock["busy"])
+    monkeypatch.setattr(cores, "busy_seconds", lambda: clock["busy"])
     monkeypatch.setattr(cores.os, "getloadavg", lambda: (3.0, 3.0, 3.0))
     monkeypatch.setattr(cores, "_last_look", cores._Look(at=-1e9, busy=None, own=0.0, free=1))
     assert cores.free_cores() == 1  # the load alone is known
