@@ -148,10 +148,23 @@ def _applied(loader: _Loader, name: str, node: yaml.Node) -> Any:
         if not all(isinstance(value, str) for value in values):
             raise _Refused(f"the tag {node.tag!r} makes a path of other things than names")
         return Path(PurePath(*values))
+    if name == "builtins.getattr":
+        return _member(values, node.tag)
     kind = _named(node.tag, name)
     if not (issubclass(kind, enum.Enum) and len(values) == 1 and isinstance(values[0], str | int)):
         raise _Refused(f"the tag {node.tag!r} calls what is not to be called")
     return kind(values[0])
+
+
+def _member(values: list[Any], tag: str) -> enum.Enum:
+    """A member of an enumeration by its name, as the first releases of Python 3.11 write it (Debian's 3.11.2): nothing
+    is looked up but the names of members.
+    """
+    if len(values) == 2 and isinstance(values[0], type) and issubclass(values[0], enum.Enum):
+        member = values[0].__members__.get(values[1]) if isinstance(values[1], str) else None
+        if member is not None:
+            return member
+    raise _Refused(f"the tag {tag!r} names what is no part of a fillerbuster run")
 
 
 def _tuple(loader: _Loader, node: yaml.Node) -> tuple:

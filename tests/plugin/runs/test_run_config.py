@@ -14,6 +14,7 @@ from helpers.folders.runs import generated_views, make_run
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.plugins.registry import discover_methods
+from nerfstudio.utils.writer import EventName
 
 from fb_nerfstudio.earlier_names import EARLIER_NAMES
 from fb_nerfstudio.runs.run_config import ALLOWED, read_run_config
@@ -50,6 +51,53 @@ def test_options_of_every_method_are_read_as_by_nerfstudio(tmp_path: Path, name:
         type(read.data) is type(config.data)
         and read.pipeline.datamanager._target is config.pipeline.datamanager._target
     )
+
+
+_APPLY = "tag:yaml.org,2002:python/object/apply:"
+
+
+class ByName(yaml.Dumper):
+    """Writes members of enumerations as Python 3.11.2 does."""
+
+
+class ByValue(yaml.Dumper):
+    """Writes them as later releases do."""
+
+
+ByName.add_representer(
+    EventName, lambda dumper, event: dumper.represent_sequence(f"{_APPLY}builtins.getattr", [EventName, event.name])
+)
+ByValue.add_representer(
+    EventName,
+    lambda dumper, event: dumper.represent_sequence(f"{_APPLY}nerfstudio.utils.writer.EventName", [event.value]),
+)
+
+
+@pytest.mark.parametrize("dumper", [ByName, ByValue])
+def test_runs_of_every_release_of_python_are_read(tmp_path: Path, dumper: type[yaml.Dumper]):
+    config = copy.deepcopy(OURS["fillerbuster"])
+    text = yaml.dump(config, Dumper=dumper)
+    assert ("builtins.getattr" in text) == (dumper is ByName) and config.logging.local_writer.stats_to_track
+    (tmp_path / "config.yml").write_text(text)
+    assert read_run_config(tmp_path / "config.yml") == config == yaml.load(text, Loader=yaml.Loader)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "[!!python/name:nerfstudio.utils.writer.EventName '', mro]",
+        "[!!python/name:nerfstudio.utils.writer.EventName '', __init__]",
+        "[!!python/name:nerfstudio.utils.writer.EventName '', [ITER_TRAIN_TIME]]",
+        "[!!python/name:nerfstudio.utils.writer.EventName '']",
+        "[!!python/name:torch.optim.adam.Adam '', step]",
+        "[text, upper]",
+    ],
+)
+def test_nothing_but_members_is_looked_up_by_name(tmp_path: Path, asked: str):
+    text = yaml.dump(copy.deepcopy(OURS["fillerbuster"])) + f"extra: !!python/object/apply:builtins.getattr {asked}\n"
+    (tmp_path / "config.yml").write_text(text)
+    with pytest.raises(ValueError, match="names what is no part of a fillerbuster run; nothing of it was executed"):
+        read_run_config(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize("name", ["fillerbuster", "fillerbuster-masked"])
