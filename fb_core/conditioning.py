@@ -221,7 +221,7 @@ def _encoded_or_shared(vae: VAE, told: Float[Tensor, "n c h w"], encoding: Encod
         return encode_frozen(vae, told, at_once, precision)
     return torch.cat(
         [
-            shared.of(partial(encode_frozen, vae, part, at_once, precision), part, f"{precision} {vae.config}")
+            shared.of(partial(encode_frozen, vae, part, at_once, precision), vae, part, str(precision))
             for part in told.split(at_once)
         ]
     )

@@ -31,7 +31,7 @@ class FreeSpace:
 
     def crossed(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether a ray of some picture has passed each point well before the surface that it shows; memory does not
-        grow with pictures.
+        grow with pictures. Points that are not finite lie in no free space.
         """
         result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         for camera, depth in zip(self.cameras, self.depth, strict=True):

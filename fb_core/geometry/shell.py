@@ -121,8 +121,10 @@ def fit_shell(
     log_distance = log_distance.clamp(bounds[0], bounds[1])
     directions = _table_directions(center)
     table, density = _regressed(directions, offset / distance[:, None], log_distance, bandwidth_degrees)
-    if standing is not None:
+    standing = None if standing is None else standing[torch.isfinite(standing).all(dim=1)]
+    if standing is not None and len(standing):
         away = (directions @ (standing.to(center) - center).T).amax(dim=1).clamp(min=0)
+        away = away.clamp(max=float(bounds[1].exp()))  # a stray camera beyond all surfaces stood nowhere
         table = _with_room(table, density, away + _ROOM_TO_STAND * float(distance.median()))
     if up is not None:
         for axis in (up, -up):

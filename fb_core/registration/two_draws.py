@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fb_core.geometry.cameras import Pinholes
@@ -21,6 +21,8 @@ limit of RRA@15 and RTA@15). Answers that have nothing in common agree on 2 % of
 """
 LEAST_AGREEMENT = 0.5
 """Share of a photo's pairs that two answers must agree on."""
+_ONE_PLACE = 0.05
+"""Of the way between the farthest two cameras: a shorter one has no direction that a model could say twice."""
 
 
 def agreement(
@@ -34,8 +36,8 @@ def agreement(
     Args:
         first: cameras of the photos, one each; None where there is none.
         second: the other answer, of the same photos.
-        apart: whether the cameras stand apart. Where all stand in one place there is no way from one to the other, and
-            the turn decides alone.
+        apart: whether the cameras stand apart. Where all stand in one place, or both answers say so of a pair (photos
+            from a tripod, a photo twice), there is no way from one to the other, and the turn decides alone.
     """
     shares = torch.full((len(first),), math.nan, dtype=torch.float64)
     both = [(a, b) for a, b in zip(first, second, strict=True) if a is not None and b is not None]
@@ -47,10 +49,16 @@ def agreement(
     alike = torch.rad2deg(cosine.clamp(-1, 1).acos()) < AGREEING_DEGREES
     if apart:
         between = torch.nn.functional.cosine_similarity(*ways, dim=2, eps=1e-30)
-        alike &= torch.rad2deg(between.clamp(-1, 1).acos()) < AGREEING_DEGREES
+        alike &= (torch.rad2deg(between.clamp(-1, 1).acos()) < AGREEING_DEGREES) | (_short(ways[0]) & _short(ways[1]))
     alike.fill_diagonal_(False)
     shares[torch.tensor(there)] = alike.double().sum(dim=1) / (len(both) - 1)
     return shares
+
+
+def _short(ways: Float[Tensor, "n n 3"]) -> Bool[Tensor, "n n"]:
+    """Which pairs of cameras stand in one place, beside how far the others stand apart."""
+    lengths = ways.norm(dim=2)
+    return lengths <= _ONE_PLACE * lengths.max()
 
 
 def _relative(cameras: Sequence[Pinholes]) -> tuple[Float[Tensor, "n n 3 3"], Float[Tensor, "n n 3"]]:

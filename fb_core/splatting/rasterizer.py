@@ -322,7 +322,7 @@ def _check(splats: Gaussians, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor 
     _expect("Ks", Ks, (cameras, 3, 3), means)
     for name, tensor in {"viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds}.items():
         if (
-            tensor is not None and not math.isfinite(float(tensor.sum())) and not bool(tensor.isfinite().all())
+            tensor is not None and not math.isfinite(float(tensor.detach().sum())) and not bool(tensor.isfinite().all())
         ):  # the sum is quicker
             raise ValueError(f"{name} should be finite but holds NaN or infinity: leave that camera out or repair it.")
     if not bool((Ks[:, [0, 1], [0, 1]] > 0).all()):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
@@ -30,6 +30,8 @@ _SAME_DEPTH = 0.1
 """Of the depth, by which two cameras may differ about a surface: splats of some hundred steps are no better."""
 _FEWEST_BORNE_OUT = 0.2
 """Share of a capture's surface that two cameras must agree on for the rest to be left out."""
+_ELSEWHERE = 0.01
+"""Of the depth, by which a second camera must stand apart from the first to tell anything of it."""
 SMALL_SIDE = 64
 """Pixels; what was seen is judged on pictures of at most this size, which bounds time for large views and captures."""
 
@@ -126,8 +128,8 @@ def surface_points(splats: TrainedSplats, cameras: Sequence[Pinholes], *, limit:
     pictures).
 
     Where one camera alone shows something, splats may stand anywhere along its rays, and often stand close before it.
-    So a point counts when the depth in another camera bears it out; where hardly any is borne out (a single camera),
-    all count.
+    So a point counts when the depth in a camera that stands elsewhere bears it out; where hardly any is borne out (a
+    single camera, or all in one place), all count.
     """
     small = [coarse(camera) for camera in cameras]
     depths = []
@@ -135,9 +137,9 @@ def surface_points(splats: TrainedSplats, cameras: Sequence[Pinholes], *, limit:
         rendered = render_geometry(splats, camera)
         depths.append(torch.where(rendered.solid, rendered.depth, 0.0)[0])
     groups = [camera.unproject(depth[None])[0][depth > 0] for camera, depth in zip(small, depths, strict=True)]
-    points = torch.cat(groups) if groups else torch.empty(0, 3)
-    points = _evenly(points, limit)
-    borne_out = _showing(small, depths, points) > 1  # its own camera is one
+    points = _evenly(torch.cat(groups) if groups else torch.empty(0, 3), limit)
+    origins = [camera.centers.expand_as(group) for camera, group in zip(small, groups, strict=True)]
+    borne_out = _borne_out(small, depths, points, _evenly(torch.cat(origins) if origins else torch.empty(0, 3), limit))
     return points[borne_out] if float(borne_out.float().mean()) > _FEWEST_BORNE_OUT else points
 
 
@@ -145,18 +147,24 @@ def _evenly(points: Float[Tensor, "m 3"], limit: int) -> Float[Tensor, "_m 3"]:
     return points[torch.linspace(0, len(points) - 1, min(len(points), limit), dtype=torch.float64).long()]
 
 
-def _showing(
-    cameras: Sequence[Pinholes], depths: Sequence[Float[Tensor, "_h _w"]], points: Float[Tensor, "m 3"]
-) -> Int[Tensor, " m"]:
-    """How many of the cameras show each point: it lies in the picture, at the depth that stands there."""
-    number = torch.zeros(len(points), dtype=torch.int64)
+def _borne_out(
+    cameras: Sequence[Pinholes],
+    depths: Sequence[Float[Tensor, "_h _w"]],
+    points: Float[Tensor, "m 3"],
+    origins: Float[Tensor, "m 3"],
+) -> Bool[Tensor, " m"]:
+    """Whether a camera that stands apart from each point's origin (the camera that shows it) shows the point too: it
+    lies in the picture, at the depth that stands there.
+    """
+    result = torch.zeros(len(points), dtype=torch.bool)
     for camera, depth in zip(cameras, depths, strict=True):
         pixels, away = (one[0] for one in camera.project(points))
         size = pixels.new_tensor([depth.shape[1], depth.shape[0]])
         inside = ((pixels >= 0) & (pixels < size)).all(dim=-1) & (away > 0)
+        inside &= (origins - camera.centers).norm(dim=1) > _ELSEWHERE * away
         column, row = pixels[inside].long().unbind(dim=-1)
-        number[inside] += (depth[row, column] - away[inside]).abs() < _SAME_DEPTH * away[inside]
-    return number
+        result[inside] |= (depth[row, column] - away[inside]).abs() < _SAME_DEPTH * away[inside]
+    return result
 
 
 def free_space(splats: TrainedSplats, cameras: Sequence[Pinholes]) -> FreeSpace:

@@ -45,7 +45,7 @@ class Unseen:
         """
         if space is None:
             return self
-        crossed = space.crossed(self.points.reshape(-1, 3).nan_to_num(posinf=1e6))
+        crossed = space.crossed(self.points.reshape(-1, 3))  # what is infinitely far off, no ray has passed
         return dataclasses.replace(self, mask=self.mask & ~crossed.reshape(self.mask.shape))
 
 

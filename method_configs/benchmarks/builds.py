@@ -68,6 +68,11 @@ class Builds(TableFiles):
             raise ValueError(
                 f"bench builds: expected at least one room and one thread, got {self.rooms} and {self.threads}"
             )
+        if self.training_steps < 0 or not (self.cases or self.training_steps):
+            raise ValueError(
+                f"bench builds: expected at least one case or training step, got {len(self.cases)} cases and "
+                f"{self.training_steps} steps"
+            )
         cases = [_Case.of(text) for text in self.cases]
         report = Report(seed=self.seed)
         with (

@@ -38,6 +38,8 @@ def test_a_build_against_itself_is_as_good_to_the_last_digit(tmp_path, monkeypat
         ({"other": ROOT, "cases": ("0+3",)}, r"got '0\+3'"),
         ({"other": ROOT, "cases": ("2+3x0",)}, r"got '2\+3x0'"),
         ({"other": ROOT, "rooms": 0}, "at least one room"),
+        ({"other": ROOT, "cases": ()}, "expected at least one case or training step, got 0 cases and 0 steps"),
+        ({"other": ROOT, "training_steps": -1}, "got 2 cases and -1 steps"),
     ],
 )
 def test_bad_options_are_one_sentence(options, said):

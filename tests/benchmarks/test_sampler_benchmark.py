@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 from helpers.tiny_models import save_tiny_model
@@ -68,7 +69,9 @@ def test_starting_at_a_strength_costs_no_passes_and_no_order():
     assert all(row["passes"] == (47 if row["solver"] == "heun" else row["steps"]) for row in rows)
 
 
-@pytest.mark.parametrize("nonsense", [{"views": 1}, {"steps": (0,)}, {"guidance": ()}, {"problems": 0}])
+@pytest.mark.parametrize(
+    "nonsense", [{"views": 1}, {"steps": (0,)}, {"guidance": ()}, {"guidance": (1.0, math.nan)}, {"problems": 0}]
+)
 def test_nonsense_is_refused(nonsense):
     with pytest.raises(ValueError, match="at least one problem"):
         SamplerBenchmark(**nonsense)

@@ -206,7 +206,7 @@ class Prepared:
         half = torch.is_autocast_enabled(tokens.device.type) and torch.get_autocast_dtype(tokens.device.type)
         deciding = [stream.taken(tokens), None if frames is None else frames.chosen(stream.places).frame]
         deciding += [values for context in contexts if context is not None for values in context]
-        return self._shared.of(compute, f"known tokens {half} {stream.scenes}", *deciding)
+        return self._shared.of(compute, self.dit, f"known tokens {half} {stream.scenes}", *deciding)
 
     def only(self, branches: slice) -> Prepared:
         """The same with some of its branches; shares all constants, so it costs nothing."""

@@ -8,6 +8,7 @@ guidance.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -70,9 +71,10 @@ class SamplerBenchmark:
         if (
             min(self.problems, self.views - 1, self.fine_steps, self.reference_steps, *self.steps) < 1
             or not self.guidance
+            or not all(map(math.isfinite, self.guidance))
         ):
             raise ValueError(
-                f"benchmark: expected at least one problem, step and guidance scale, and two views, got {self}"
+                f"benchmark: expected at least one problem, step and finite guidance scale, and two views, got {self}"
             )
         if not 0 < self.strength < 1:
             raise ValueError(f"benchmark: expected a strength between 0 and 1, got {self.strength}")

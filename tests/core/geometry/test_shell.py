@@ -77,6 +77,17 @@ def test_what_is_seen_close_by_stays_close():
     assert float(shell.radius(torch.tensor([[1.0, 0.0, 0.0]]))) < 0.55
 
 
+@pytest.mark.parametrize("stray", [[-50.0, 0.0, 0.0], [math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0]])
+def test_a_stray_camera_does_not_move_the_shell_beyond_what_was_seen(stray: list[float]) -> None:
+    unit = directions(4000)
+    points, behind = 2.0 * unit[unit[:, 0] > 0.3], torch.tensor([[-1.0, 0.0, 0.0]])
+    options = {"center": torch.zeros(3), "fallback_radius": 1.0}
+    standing = torch.tensor([[0.1, 0.0, 0.0], stray])
+    assert 1.2 < float(fit_shell(points, standing=standing, **options).radius(behind)) < 1.7 * 2.0
+    nobody = fit_shell(points, standing=torch.empty(0, 3), **options)
+    assert torch.equal(nobody.log_radius, fit_shell(points, **options).log_radius)
+
+
 def test_a_few_stray_points_do_not_move_the_shell():
     unit = directions(1000)
     points = 2.0 * unit

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -134,6 +138,51 @@ def test_a_changed_question_is_never_answered_with_what_was_kept(model, work, wh
     assert "known" in work
     model.shared = None
     assert same(got, ask(model, views, 0, sampling))
+
+
+@pytest.mark.parametrize("part", ["dit", "image_vae", "raymap_vae"])
+@pytest.mark.parametrize("how", ["written to", "loaded", "another network"])
+def test_other_weights_are_never_answered_with_what_was_kept(model, part: str, how: str) -> None:
+    views, network = posed(), getattr(model, part)
+    model.shared = SharedResults()
+    ask(model, views)
+    other = copy.deepcopy(network)
+    for weight in other.parameters():
+        weight.mul_(1.25)
+    if how == "written to":
+        for weight in network.parameters():
+            weight.mul_(1.25)
+    elif how == "loaded":
+        network.load_state_dict(other.state_dict())
+    else:
+        setattr(model, part, other)
+    got = ask(model, views)
+    model.shared = None
+    assert same(got, ask(model, views))
+
+
+def test_a_copy_of_a_model_with_all_that_it_keeps_answers_as_the_model(model) -> None:
+    model.shared = SharedResults()
+    expected = ask(model, posed())
+    for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        assert same(expected, ask(twin, posed())) and same(expected, ask(model, posed()))
+
+
+def test_threads_get_right_answers_and_the_bound_holds() -> None:
+    shared, switching = SharedResults(4000), sys.getswitchinterval()
+
+    def asked(turn: int) -> bool:
+        name = turn * 7 % 23
+        return int(shared.of(lambda: torch.full((100,), name), str(name))[0]) == name
+
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            assert all(pool.map(asked, range(3000)))
+    finally:
+        sys.setswitchinterval(switching)
+    kept = sum(size for _, size in shared._results.values())
+    assert 0 < shared.bytes == kept <= 4000
 
 
 # ---- memory ----------------------------------------------------------------------------------------------------------

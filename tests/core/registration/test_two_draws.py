@@ -47,6 +47,25 @@ def test_cameras_in_one_place_agree_by_their_turns():
     assert agreement(each(here), elsewhere(here, 1), apart=False).tolist() == [1.0] * 5
 
 
+def on_a_tripod(seed: int, places: tuple[int, ...] = (0, 0, 0, 0, 0, 4)) -> list[Pinholes | None]:
+    """A ring's turns, but each photo from the place of another; places err by a hundredth of the ring's radius."""
+    cameras = ring(6)
+    centers = cameras.centers[list(places)]
+    noise = torch.randn(6, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    centers = centers + 0.01 * float(cameras.centers.std()) * noise
+    moved = dataclasses.replace(cameras, camera_to_world=torch.cat([cameras.rotations, centers[:, :, None]], dim=2))
+    return elsewhere(moved, seed)
+
+
+def test_photos_from_a_tripod_beside_one_from_elsewhere_agree():
+    assert agreement(on_a_tripod(1), on_a_tripod(2), apart=True).tolist() == [1.0] * 6
+
+
+def test_who_says_one_place_and_then_another_does_not_agree():
+    shares = agreement(on_a_tripod(1), on_a_tripod(2, places=(0, 1, 2, 3, 4, 5)), apart=True)
+    assert float(shares.max()) < 0.5
+
+
 def test_photos_without_two_cameras_have_no_share():
     cameras = each(ring(4))
     missing = [cameras[0], None, cameras[2], cameras[3]]

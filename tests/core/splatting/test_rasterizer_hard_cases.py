@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 
 import jaxtyping
 import pytest
@@ -247,3 +248,15 @@ def test_sizes_that_no_picture_has_are_refused_before_anything_is_allocated(
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     with pytest.raises(ValueError, match=told):
         rasterization(**{**splats(), **size})
+
+
+def test_cameras_that_are_trained_too_are_no_reason_for_a_warning() -> None:
+    inputs = splats()
+    inputs["viewmats"].requires_grad_()
+    torch.set_warn_always(True)  # else torch warns once in a process
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            rasterization(**inputs, backgrounds=torch.ones(1, 3).to(inputs["means"]).requires_grad_())
+    finally:
+        torch.set_warn_always(False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import pytest
 import torch
 from helpers.plugin.datamanagers import (
     stand_in_model,  # noqa: F401
@@ -14,7 +15,13 @@ from fb_core.geometry.cameras import Pinholes
 from fb_core.geometry.free_space import FreeSpace
 from fb_core.geometry.shell import sphere
 from fb_nerfstudio.capture.splat_renders import Rendered, surface_points
-from fb_nerfstudio.capture.unseen import find_unseen, unseen_gaussians, with_matched_colors, with_unseen_masks
+from fb_nerfstudio.capture.unseen import (
+    Unseen,
+    find_unseen,
+    unseen_gaussians,
+    with_matched_colors,
+    with_unseen_masks,
+)
 
 # ---- unseen pixels --------------------------------------------------------------------------------------------------
 
@@ -87,3 +94,30 @@ def test_a_surface_that_one_camera_alone_shows_is_none():
 def test_a_single_camera_is_believed():
     points = surface_points(Blobs(), three_cameras()[:1])
     assert len(points) == 256 and int((points[:, 2] == 1.0).sum()) == 64
+
+
+@pytest.mark.parametrize("turns", [(0.0, 0.0), (0.0, 30.0, 60.0)], ids=["twice the same", "a turn on the spot"])
+def test_a_second_camera_in_the_same_place_bears_nothing_out(turns: tuple[float, ...]):
+    """From one place splats look alike wherever they stand along its rays, so no direction is left out."""
+    angles = torch.deg2rad(torch.tensor(turns))
+    ahead = torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], dim=1)
+    looking = Pinholes.looking_at(
+        torch.zeros(len(turns), 3), ahead, up=torch.tensor([0.0, -1.0, 0.0]), fov_degrees=90.0, width=16, height=16
+    )
+    assert len(surface_points(Blobs(), [looking[index] for index in range(len(turns))])) == 256 * len(turns)
+
+
+def test_of_cameras_that_stand_apart_a_double_is_no_second_witness():
+    first, *others = three_cameras()
+    points = surface_points(Blobs(), [first, first, *others])
+    assert len(points) > 600 and bool((points[:, 2] == 4.0).all()), "the blob before the doubled camera is none"
+
+
+def test_what_is_infinitely_far_off_is_in_no_free_space():
+    """Rays that never meet the shell point to infinity, some along an axis, where a coordinate is not a number."""
+    camera = two_views().cameras[0]
+    space = FreeSpace(cameras=(camera,), depth=(torch.full((8, 8), 1e9),))
+    inf, nan = float("inf"), float("nan")
+    points = torch.tensor([[inf, nan, nan], [inf, inf, inf], [-inf, inf, nan], [nan, nan, nan], [1e6, 0.0, 0.0]])
+    views = Unseen(mask=torch.ones(1, 1, 5, dtype=torch.bool), points=points[None, None])
+    assert views.without(space).mask[0, 0].tolist() == [True, True, True, True, False]
