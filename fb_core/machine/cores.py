@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 from fb_core.machine.resources import busy_seconds, usable_cores
@@ -47,3 +50,19 @@ def free_cores() -> int:
     free = max(1, usable_cores() - max(0, math.ceil(others - _IDLE_SHARE)))
     _last_look = _Look(at=now, busy=busy, own=own, free=free)
     return free
+
+
+@contextmanager
+def fixed_number(fixed: ContextVar[int | None], number: int) -> Iterator[None]:
+    """Inside the block the variable says how many threads are to be taken, whatever is free, for measuring and for
+    tests.
+
+    Raises ValueError for a number below 1.
+    """
+    if number < 1:
+        raise ValueError(f"number: expected 1 thread or more, got {number}")
+    token = fixed.set(number)
+    try:
+        yield
+    finally:
+        fixed.reset(token)

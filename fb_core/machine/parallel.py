@@ -7,13 +7,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from typing import TypeVar
 
 import torch
 
-from fb_core.machine.cores import free_cores
+from fb_core.machine.cores import fixed_number, free_cores
 from fb_core.machine.resources import free_memory_bytes
 
 Item = TypeVar("Item")
@@ -33,19 +33,12 @@ def workers_for(jobs: int, bytes_each: float) -> int:
     return max(1, min(jobs, free_cores(), room))
 
 
-@contextmanager
-def fixed_workers(number: int) -> Iterator[None]:
+def fixed_workers(number: int) -> AbstractContextManager[None]:
     """Inside the block so many threads, whatever is free, for measuring and for tests.
 
     Raises ValueError for a number below 1.
     """
-    if number < 1:
-        raise ValueError(f"number: expected 1 thread or more, got {number}")
-    token = _fixed.set(number)
-    try:
-        yield
-    finally:
-        _fixed.reset(token)
+    return fixed_number(_fixed, number)
 
 
 def in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:

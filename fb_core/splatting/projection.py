@@ -98,7 +98,7 @@ class Gaussians:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Constants:
+class ProjectionConstants:
     """What decides how Gaussians are projected, and gets no gradient."""
 
     Ks: Float[Tensor, "c 3 3"]
@@ -106,6 +106,14 @@ class _Constants:
     usable: Bool[Tensor, " n"] | None
     """Rows where it is False are never drawn; None for all that are."""
     settings: ProjectionSettings
+
+    @staticmethod
+    def of(
+        splats: Gaussians, Ks: Float[Tensor, "c 3 3"], usable: Bool[Tensor, " n"] | None, settings: ProjectionSettings
+    ) -> ProjectionConstants:
+        """Of Gaussians and cameras."""
+        opacities = splats.opacities.detach().contiguous()
+        return ProjectionConstants(Ks=Ks, opacities=opacities, usable=usable, settings=settings)
 
 
 def project_splats(
@@ -119,8 +127,17 @@ def project_splats(
 
     Rows where `usable` is False are never drawn. Gradients do not flow to Ks or opacities.
     """
-    constants = _Constants(Ks=Ks, opacities=splats.opacities.detach(), usable=usable, settings=settings)
-    means2d, conics, depths, compensations, radii, determinants = _Project.apply(
+    return projected_by(_Project, splats, viewmats, ProjectionConstants.of(splats, Ks, usable, settings))
+
+
+def projected_by(
+    function: type[torch.autograd.Function],
+    splats: Gaussians,
+    viewmats: Float[Tensor, "c 4 4"],
+    constants: ProjectionConstants,
+) -> Projection:
+    """What an autograd function of means, quats, scales, covars, viewmats and constants gives, by its names."""
+    means2d, conics, depths, compensations, radii, determinants = function.apply(
         splats.means, splats.quats, splats.scales, splats.covars, viewmats, constants
     )
     return Projection(
@@ -158,7 +175,7 @@ def _hidden(view: Footprint, radii: tuple[Tensor, Tensor], opacity: Tensor, sett
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, covars, viewmats, constants: _Constants):
+    def forward(ctx, means, quats, scales, covars, viewmats, constants: ProjectionConstants):
         cameras, n = viewmats.shape[0], means.shape[0]
         opacities, usable, settings = constants.opacities, constants.usable, constants.settings
         floor, square = settings.semantics.compensation_floor, settings.semantics.square_boxes

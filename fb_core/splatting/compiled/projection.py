@@ -7,7 +7,6 @@ the chunks: any number of threads gives the same bits.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +17,13 @@ from torch.autograd.function import once_differentiable
 from fb_core.splatting.compiled.library import library_for
 from fb_core.splatting.compiled.threads import in_ranges, threads_for
 from fb_core.splatting.footprint import Lens
-from fb_core.splatting.projection import Gaussians, Projection, ProjectionSettings
+from fb_core.splatting.projection import (
+    Gaussians,
+    Projection,
+    ProjectionConstants,
+    ProjectionSettings,
+    projected_by,
+)
 
 _CHUNK = 2048
 """`CHUNK` of projection.c."""
@@ -50,16 +55,6 @@ class _Pointers(ctypes.Structure):
     _fields_ = [("addresses", ctypes.c_void_p * 10)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Constants:
-    """What decides how Gaussians are projected, and gets no gradient."""
-
-    Ks: Float[Tensor, "c 3 3"]
-    opacities: Float[Tensor, " n"]
-    usable: Bool[Tensor, " n"] | None
-    settings: ProjectionSettings
-
-
 def project_compiled(
     splats: Gaussians,
     viewmats: Float[Tensor, "c 4 4"],
@@ -68,18 +63,8 @@ def project_compiled(
     settings: ProjectionSettings,
 ) -> Projection:
     """As `projection.project_splats`; the library must have been made (`library.loaded`)."""
-    constants = _Constants(Ks=Ks, opacities=splats.opacities.detach().contiguous(), usable=usable, settings=settings)
-    means2d, conics, depths, compensations, radii, determinants = _CompiledProjection.apply(
-        splats.means, splats.quats, splats.scales, splats.covars, viewmats, constants
-    )
-    return Projection(
-        means2d=means2d,
-        conics=conics,
-        depths=depths,
-        compensations=compensations,
-        radii=radii,
-        determinants=determinants,
-    )
+    constants = ProjectionConstants.of(splats, Ks, usable, settings)
+    return projected_by(_CompiledProjection, splats, viewmats, constants)
 
 
 def _pointers(*tensors: Tensor | None) -> _Pointers:
@@ -87,7 +72,7 @@ def _pointers(*tensors: Tensor | None) -> _Pointers:
     return _Pointers((ctypes.c_void_p * 10)(*addresses))
 
 
-def _splats(held: list[Tensor | None], constants: _Constants) -> _Splats:
+def _splats(held: list[Tensor | None], constants: ProjectionConstants) -> _Splats:
     """Of contiguous means, quats, scales, covars; covars take the place of the two before."""
     means, usable = held[0], constants.usable
     assert means is not None, "means are always given"
@@ -111,7 +96,7 @@ def _contiguous(tensors: tuple[Tensor | None, ...]) -> list[Tensor | None]:
 
 class _CompiledProjection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, covars, viewmats, constants: _Constants):
+    def forward(ctx: Any, means, quats, scales, covars, viewmats, constants: ProjectionConstants):
         settings, cameras, n = constants.settings, viewmats.shape[0], means.shape[0]
         library, held = library_for(means.dtype), _contiguous((means, quats, scales, covars))
         splats, views = _splats(held, constants), []
@@ -157,7 +142,7 @@ class _CompiledProjection(torch.autograd.Function):
 
 def _camera_gradient(
     held: list[Tensor | None],
-    drawn_by: tuple[_Camera, _Constants],
+    drawn_by: tuple[_Camera, ProjectionConstants],
     incoming: list[Tensor | None],
     radii: Int32[Tensor, " n"] | Int32[Tensor, "n 2"],
     totals: list[Tensor | None],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-from fb_core.machine.cores import free_cores
+from fb_core.machine.cores import fixed_number, free_cores
 
 _ROWS_PER_THREAD = 20_000  # (Gaussian, cell), or Gaussians: below these another thread costs more than it saves
 _PARTS_PER_THREAD = 4  # some take longer than others
@@ -31,19 +31,12 @@ def threads_for(rows: int) -> int:
     return 1 if rows < 2 * _ROWS_PER_THREAD else min(free_cores(), rows // _ROWS_PER_THREAD)
 
 
-@contextmanager
-def fixed_threads(number: int) -> Iterator[None]:
+def fixed_threads(number: int) -> AbstractContextManager[None]:
     """Inside the block so many threads, whatever there is to do, for measuring and for tests.
 
     Raises ValueError for a number below 1.
     """
-    if number < 1:
-        raise ValueError(f"number: expected 1 thread or more, got {number}")
-    token = _fixed.set(number)
-    try:
-        yield
-    finally:
-        _fixed.reset(token)
+    return fixed_number(_fixed, number)
 
 
 def in_parts(work: Callable[[int, int], None], starts: Int32[Tensor, " cells+1"], threads: int) -> None:
